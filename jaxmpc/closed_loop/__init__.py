@@ -7,6 +7,8 @@ summarise_runs             the numbers and the table of many runs -> RunsSummary
 evaluate_runs              limits kept, target reached, settling time and cost -> Outcome
 RobotController            an MPC with the linear models of a robot
 robot_mpc                  the MPC of a robot, from the limits of its model
+draw_disturbances          random sequences of the disturbances of a robust problem
+worst_disturbance          one that brings a closed loop far beyond its limits, by gradient
 LinearFeedback             LQR or PD with clipping, to compare with
 Noise                      random disturbances of the plant and of what is measured
 KalmanFilter               estimates of the state from noisy outputs -> Belief
@@ -20,6 +22,7 @@ draw_robots                random starts and random factors of masses, damping a
 randomised                 random masses, damping, payloads of robots, for `variations`
 """
 
+from jaxmpc.closed_loop.disturbances import draw_disturbances, worst_disturbance
 from jaxmpc.closed_loop.environment import Environment, MPCPolicy
 from jaxmpc.closed_loop.estimation import Disturbance, KalmanFilter, Noise
 from jaxmpc.closed_loop.feedback import LinearFeedback
@@ -41,6 +44,7 @@ __all__ = [
     "RobotController",
     "Run",
     "augmented",
+    "draw_disturbances",
     "draw_robots",
     "evaluate_runs",
     "lyapunov_decrease",
@@ -50,4 +54,5 @@ __all__ = [
     "simulate_into",
     "simulate_many",
     "summarise_runs",
+    "worst_disturbance",
 ]

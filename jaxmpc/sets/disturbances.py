@@ -57,6 +57,10 @@ class Vertices(ConvexSet):
         xp, (along, points) = numbers(d, self.points)
         return xp.max(product(xp, along, points.T), axis=-1)
 
+    def vertices(self) -> np.ndarray:
+        """Return the points. NumPy; not traceable."""
+        return host_array("disturbance", self.points)
+
     def _require_fields(self, argument: str, dimension: int | None = None) -> None:
         shape = np.shape(as_array(self.points))
         if len(shape) != 2 or not all(shape) or dimension not in (None, shape[1]):

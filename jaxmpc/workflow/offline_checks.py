@@ -163,6 +163,9 @@ def offline_report(
             of it; what they do not settle is open.
         progress: print each stage on stderr.
 
+    Of a robust problem sets, claims and theorems are about every disturbance; the closed loops have
+    none.
+
     Raises ValueError for an ill-posed problem, and where x0s is None and the feasible set is empty,
     flat or unbounded. NumPy; not traceable. Proofs are in float64.
     """

@@ -101,6 +101,8 @@ class Sweep:
                 the L1 weight of soft limits, a number or "exact" (jaxmpc info; sets stay hard)
       [mpc]     horizon; optional terminal, constrain_initial = false (no limits at k = 0),
                 control_horizon (free inputs, the last one is held)
+      [disturbance]  optional: w_min, w_max; E of x+ = A x + B u + E w, gain of the policy
+                u = v + gain (x - z): feasible means that all limits are kept for every such w
       and what jaxmpc tune writes, see its help: [limits] margin, [mpc] H_f, h_f or P_f, level_f,
       [solver]
       [sweep]   all optional: grid, lower, upper, axes, fixed, projection, iterations, dtype

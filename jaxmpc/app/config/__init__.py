@@ -6,6 +6,7 @@
     [limits]  x_min, x_max, margin  or  H_x, h_x;  u_min, u_max
     [cost]    Q, R, P, rho
     [mpc]     horizon, terminal  or  H_f, h_f  or  P_f, level_f;  constrain_initial, control_horizon
+    [disturbance]  w_min, w_max, E, policy, gain
     [solver]  iterations, rho, alpha, newton_steps
     [sweep]   grid, lower, upper, axes, fixed | projection, iterations, dtype
     [recursion]  steps, grid, lower, upper, regions, seconds

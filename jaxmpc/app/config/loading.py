@@ -201,6 +201,18 @@ def check(config: Config, command: str = "sweep") -> None:
     _check_order("limits", limits, "u_min", "u_max")
     _check_state_limits(config)
     _check_terminal_set(config, n)
+    if config.disturbance is not None:
+        given = config.disturbance
+        _check_order("disturbance", given, "w_min", "w_max")
+        p = n if given.E is None else len(given.E[0])
+        for key, size in (("w_min", p), ("w_max", p)):
+            if len(getattr(given, key)) != size:
+                what = f"has {len(getattr(given, key))} entries where {size} are needed"
+                fail(f"disturbance.{key}", what, "One for each column of E, without E each state")
+        for key, shape in (("E", (n, p)), ("gain", (m, n))):
+            value = getattr(given, key)
+            if value is not None and np.shape(value) != shape:
+                fail(f"disturbance.{key}", f"shape {np.shape(value)}", f"Give {shape}")
     require_horizon(config, "mpc.horizon", config.mpc.horizon)
     if command == "sweep":
         _check_sweep(config, n)

@@ -28,7 +28,7 @@ from jaxmpc.mpc.problem import MPC, soften
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope
 from jaxmpc.sets.invariant import named_terminal_set
-from jaxmpc.systems.riccati import lqr
+from jaxmpc.systems.riccati import LQR, lqr
 from jaxmpc.systems.system import LinearSystem
 
 
@@ -118,6 +118,18 @@ class MPCSection:
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
+class DisturbanceSection:
+    """x⁺ = A x + B u + c + E w with w_min <= w <= w_max: limits are kept for all of them."""
+
+    w_min: Vector  # (p,), at most 0
+    w_max: Vector  # (p,), at least 0
+    E: Matrix | None = None  # (n, p), none means the identity
+    # How later inputs answer to w: by a gain, or, in recursion alone, by any affine function.
+    policy: Literal["tightened", "affine"] = "tightened"
+    gain: Matrix | None = None  # (m, n), none means that of the LQR
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class SweepSection:
     """The initial states of a sweep: a grid over the mapped states."""
 
@@ -173,6 +185,12 @@ KEYS = {
     "inputs": "limits.u_min, u_max",
     "inputs.lower": "limits.u_min",
     "inputs.upper": "limits.u_max",
+    "disturbance": "disturbance.w_min, w_max",
+    "disturbance.lower": "disturbance.w_min",
+    "disturbance.upper": "disturbance.w_max",
+    "disturbance_matrix": "disturbance.E",
+    "gain": "disturbance.gain",
+    "policy": "disturbance.policy",
     "states.H": "limits.H_x",
     "states.h": "limits.h_x",
     "terminal_set.H": "mpc.H_f",
@@ -221,6 +239,7 @@ class Config:
     limits: LimitsSection
     cost: CostSection
     mpc: MPCSection
+    disturbance: DisturbanceSection | None = None
     sweep: SweepSection = SweepSection()
     recursion: RecursionSection = RecursionSection()
     solver: SolverSection | None = None
@@ -242,6 +261,8 @@ class Config:
     def to_dict(self, command: str = "sweep") -> dict[str, Any]:
         """Return the sections that a command reads as JSON data; infinity is "Infinity"."""
         data = json.loads(ADAPTER.dump_json(self))
+        if data["disturbance"] is None:  # as files had it before there was such a section
+            del data["disturbance"]
         return {
             key: part for key, part in data.items() if key == command or key not in SECTION_COMMANDS
         }
@@ -279,7 +300,12 @@ class Config:
             terminal_cost = regulator and regulator.P
         elif not isinstance(cost.P, str):
             terminal_cost = to_matrix(cost.P)
-        terminal_set: Any = named_terminal_set(name, system, regulator, states, inputs)
+        against = self.disturbance_fields()
+        law = regulator
+        if law is not None and against.get("gain") is not None:
+            law = LQR(K=against["gain"], P=law.P)
+        W, E = (against.get(key) for key in ("disturbance", "disturbance_matrix"))
+        terminal_set: Any = named_terminal_set(name, system, law, states, inputs, W, E)
         if self.mpc.H_f is not None:
             terminal_set = Polytope(np.asarray(self.mpc.H_f), np.asarray(self.mpc.h_f))
         if self.mpc.P_f is not None:
@@ -295,9 +321,23 @@ class Config:
             terminal_set=terminal_set,
             constrain_initial=self.mpc.constrain_initial,
             control_horizon=self.mpc.control_horizon,
+            **against,
         )
         mpc.validate()
         return mpc
+
+    def disturbance_fields(self) -> dict[str, Any]:
+        """Return the fields of `MPC` that [disturbance] gives, none without that section."""
+        given = self.disturbance
+        if given is None:
+            return {}
+        array = lambda value: None if value is None else np.asarray(value)
+        return {
+            "disturbance": Box(np.asarray(given.w_min), np.asarray(given.w_max)),
+            "disturbance_matrix": array(given.E),
+            "policy": given.policy,
+            "gain": array(given.gain),
+        }
 
     def build_controlled(self) -> MPC:
         """Return the problem that the controller solves: `build_mpc` softened by cost.rho."""

@@ -1,0 +1,91 @@
+"""Sequences of disturbances for closed loops: at random, at vertices, and the worst by gradient."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxmpc.arrays import Reals
+from jaxmpc.checks import fail, whole
+from jaxmpc.closed_loop.simulation import simulate
+from jaxmpc.mpc.problem import MPC
+from jaxmpc.sets.disturbances import disturbance_columns
+
+KINDS = ("vertices", "inside")
+
+
+def draw_disturbances(
+    mpc: MPC, steps: int, count: int, *, kind: str = "vertices", seed: int = 0
+) -> np.ndarray:
+    """Return sequences (count, steps, n) of E w with w in the disturbances of `mpc`, as `simulate`
+    takes each of them.
+
+    kind: "vertices" picks one vertex a step; "inside" a random combination of them. Raises
+    ValueError for a problem without disturbances.
+    """
+    W, E = _disturbances(mpc)
+    steps, count = whole("steps", steps, 1), whole("count", count, 1)
+    if kind not in KINDS:
+        fail("kind", f"{kind!r}", f"Give one of {', '.join(map(repr, KINDS))}")
+    rng, corners = np.random.default_rng(seed), W.vertices()
+    if kind == "vertices":
+        return corners[rng.integers(len(corners), size=(count, steps))] @ E.T
+    weights = rng.dirichlet(np.ones(len(corners)), (count, steps))
+    return weights @ corners @ E.T
+
+
+def worst_disturbance(
+    controller: Any, x0: Reals, steps: int, *, rounds: int = 10, plant: Any = None, seed: int = 0
+) -> tuple[np.ndarray, float]:
+    """Return a sequence (steps, n) of E w that brings a closed loop far beyond its state limits,
+    and how far: the violation in their units, negative by the distance that is left.
+
+    Ascent by gradient: the violation of the simulated loop is differentiated with respect to the
+    sequence, and each w moves to the vertex that raises it most, as long as that helps. A local
+    search: it finds violations, and proves nothing where there are none.
+
+    controller: of a robust problem with state limits. plant: None for its own model. rounds: at
+    most.
+    """
+    mpc = controller.mpc
+    W, E = _disturbances(mpc)
+    if controller.limits is None:
+        fail("controller", "has no state limits to exceed", "Give states to its problem")
+    steps, rounds = whole("steps", steps, 1), whole("rounds", rounds, 1)
+    corners = W.vertices() @ E.T
+    plant = mpc.system if plant is None else plant
+    limits = jax.tree.map(lambda v: jnp.asarray(v, controller.dtype), controller.limits)
+
+    def beyond(w: Array) -> Array:
+        run = simulate(controller, plant, x0, steps, disturbance=w)
+        return jnp.max(jax.vmap(lambda x: _signed(limits, x))(run.states[1:]))
+
+    rise = jax.jit(jax.value_and_grad(beyond))
+    rng = np.random.default_rng(seed)
+    w = corners[rng.integers(len(corners), size=steps)]
+    best, top = w, -np.inf
+    for _ in range(rounds):
+        value, slope = rise(jnp.asarray(w, controller.dtype))
+        if not float(value) > top:
+            break
+        best, top = w, float(value)
+        w = corners[np.argmax(np.asarray(slope, float) @ corners.T, axis=1)]
+    return best, top
+
+
+def _signed(limits: Any, x: Array) -> Array:
+    """Return by how much x exceeds the row that it exceeds most, negative inside."""
+    H, lower, upper = limits.rows()
+    value = jnp.matmul(H, x, precision="highest")
+    return jnp.max(jnp.maximum(value - upper, lower - value))
+
+
+def _disturbances(mpc: MPC) -> tuple[Any, np.ndarray]:
+    """Return W and E of a robust problem."""
+    if mpc.disturbance is None:
+        fail("mpc", "has no disturbance", "Give MPC(disturbance=jm.Box(…))")
+    n = mpc.system.n
+    W, E = mpc.disturbance, disturbance_columns(mpc.disturbance_matrix, n)
+    return W, E
