@@ -10,9 +10,9 @@ grid                 points of a regular grid
 StoredMap            the map that such a store holds, read block by block
 """
 
+from jaxmpc.feasible.boundary_points import boundary
 from jaxmpc.feasible.map import map_feasible_set
 from jaxmpc.feasible.polytope_growth import feasible_growth, feasible_polytope
-from jaxmpc.feasible.rays import boundary
 from jaxmpc.feasible.smooth_fraction import feasible_fraction
 from jaxmpc.feasible.stored import StoredMap, sweep_into
 from jaxmpc.grids import grid

@@ -1,7 +1,7 @@
 """Maps of the feasible set: every point proved feasible, proved infeasible, or undecided."""
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
@@ -16,6 +16,8 @@ from jaxmpc.checks import fail, number, require_step_type, whole
 from jaxmpc.feasible import proofs
 from jaxmpc.feasible.hard_constraints import Axes, ExactData
 from jaxmpc.feasible.pipeline import Labels, OnDemand, Scope, labelled_parts
+from jaxmpc.feasible.policy_hull import policy_hull, policy_labels
+from jaxmpc.feasible.policy_problem import PolicyProblem, problem_of
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.rays import Rays, close_gap
 from jaxmpc.mpc.problem import MPC
@@ -185,6 +187,9 @@ class FeasibleSetMap:
         `time.monotonic`, after which no round of rays begins. A set without interior, or unbounded,
         is returned as it is.
         """
+        if isinstance(self.problem, PolicyProblem):  # rays were sent for the labels
+            points, _, normals, offsets, _ = policy_hull(self.problem).bounds
+            return replace(self, bound_point=points, bound_normal=normals, bound_offset=offsets)
         try:
             rays = Rays.of(self.problem)
             proved, left = close_gap(rays, gap, rounds, deadline=deadline)
@@ -292,7 +297,10 @@ def map_feasible_set(
     inputs to the states (a terminal point) the proof is that inputs within rounding of the plan
     keep them exactly; two rows of a polytope that are opposite but for rounding are one equality.
     Where input rates are limited the states are (x, u_{−1}), and one whose previous input the input
-    limits exclude, which cannot have been applied, is labelled −1. iterations and dtype affect the
+    limits exclude, which cannot have been applied, is labelled −1. Of a robust problem a label is
+    about its policy: 1 that one keeps all rows under every disturbance, −1 that none of its kind
+    does; affine ones are combined from those at the ends of rays (`policy_hull.py`), for up to four
+    states. iterations and dtype affect the
     ADMM stage alone and cannot make a label wrong. The last undecided points, up to 2,000 in a
     call, get linear programs of some milliseconds each, an equal share of each chunk. chunk: number
     of points that a compiled program takes at once (None: by device). gap: call
@@ -311,7 +319,7 @@ def map_feasible_set(
         if axes is not None or fixed is not None:
             fail("axes, fixed", "given with a FeasibilityProblem", "It has its own view")
     else:
-        problem = FeasibilityProblem.of(mpc, axes, fixed)
+        problem = problem_of(mpc, axes, fixed)
     whole("iterations", iterations, 1)
     require_step_type(dtype)
     if gap is not None:
@@ -340,6 +348,8 @@ def map_points(
     """Label the points (B, d) of a feasibility problem; settings: those of `label_chunks`. Points
     that are left at the deadline (of `time.monotonic`) get status NOT_RUN."""
     points, parts = host_array("x0s", x0s, copy=False), list[Part[Labels]]()
+    if isinstance(problem, PolicyProblem):
+        return _map_policies(problem, points, settings)
     with ThreadPoolExecutor(1) as copies:
         kept = copies.submit(np.array, points)  # while the device works
         chunks = label_chunks(problem, points, **settings)
@@ -349,6 +359,25 @@ def map_points(
         left = Labels.empty(len(points) - done.count, problem)
         labels = Labels.joined([*(p.result for p in parts), left])
         return FeasibleSetMap.of(problem, kept.result(), labels)
+
+
+def _map_policies(
+    problem: PolicyProblem, points: np.ndarray, settings: Mapping[str, Any]
+) -> FeasibleSetMap:
+    """Label points (B, d) under affine policies."""
+    _require_points(problem, points)
+    if settings.get("executor") is not None:
+        fail("executor", "given with affine policies, whose hull one process keeps", "Leave it out")
+    chunk = settings.get("chunk")
+    chunk = None if chunk is None else whole("chunk", chunk, 1)
+    labels = policy_labels(problem, points, chunk, settings.get("devices"))
+    return FeasibleSetMap.of(problem, points.copy(), labels)
+
+
+def _require_points(problem: FeasibilityProblem, points: np.ndarray) -> None:
+    d = problem.dimension
+    if points.ndim != 2 or points.shape[1] != d:
+        fail("x0s", f"shape {points.shape}", f"Give points (B, {d}), one column a mapped state")
 
 
 def label_chunks(
@@ -363,10 +392,8 @@ def label_chunks(
 
     scope: None for that of these points; settings: further ones of `labelled_parts`.
     """
-    d = problem.dimension
     points = np.asarray(points, np.float64)
-    if points.ndim != 2 or points.shape[1] != d:
-        fail("x0s", f"shape {points.shape}", f"Give points (B, {d}), one column a mapped state")
+    _require_points(problem, points)
     if chunk is None:
         devices = count(chosen_devices(settings.get("devices")))
         held = 16 * sum(problem.rows.U.shape)  # vectors of rows and inputs

@@ -340,7 +340,7 @@ class Pipeline:
         self.short = compiled_admm(iterations, np.dtype(dtype), self.devices)
         self.long = compiled_admm(LONGER * iterations, np.dtype(np.float64), self.devices)
         self.newton = compiled_newton(each, self.devices)
-        self.prepare, self.outcome = _compiled_ends(self.devices)
+        self.prepare, self.outcome = compiled_ends(self.devices)
         data = exact, problem.rows, hull_for(problem, scope.points)
         with jax.enable_x64(True):
             self.exact, self.rows, self.hull = jax.device_put(data, placement(self.devices))
@@ -434,7 +434,7 @@ class Pipeline:
 
 
 @functools.cache
-def _compiled_ends(devices: Devices) -> tuple[Compiled, Compiled]:
+def compiled_ends(devices: Devices) -> tuple[Compiled, Compiled]:
     """Return the compiled `without_nan` and `outcome` of a batch."""
     prepare = over_devices(jax.vmap(without_nan), devices, (True,))
     return prepare, over_devices(jax.vmap(outcome), devices, (True, True))

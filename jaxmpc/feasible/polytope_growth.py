@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxmpc.checks import fail
 from jaxmpc.feasible.plan_polytope import DIMENSIONS, FACETS, CenteredPolytope, projected
-from jaxmpc.feasible.problem import FeasibilityProblem
+from jaxmpc.feasible.policy_problem import problem_of
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import record
 from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope
@@ -34,7 +34,7 @@ def feasible_polytope(mpc: MPC) -> Polytope:
     Raises ValueError where X_N is empty, flat or unbounded, for an ellipsoidal terminal set, and
     where there are too many facets. NumPy in float64; not traceable.
     """
-    problem = FeasibilityProblem.of(mpc)
+    problem = problem_of(mpc)
     plans = problem.plan_polytope
     if not plans.exact:
         fail("terminal_set", "is an Ellipsoid, so X_N has a curved boundary", "Map it and refine()")

@@ -17,7 +17,7 @@ from jaxmpc.files import as_json
 from jaxmpc.mpc.condense import Condensed, condensed_in_float64
 from jaxmpc.mpc.problem import MPC, Outputs, as_tuple
 from jaxmpc.mpc.rows import Block
-from jaxmpc.mpc.tightening import feedback_gain, without_disturbance
+from jaxmpc.mpc.tightening import feedback_gain, require_tightened, without_disturbance
 from jaxmpc.pytrees import record
 from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope, set_bounds
 from jaxmpc.sets.disturbances import disturbance_columns, with_vertices
@@ -48,6 +48,7 @@ class FeasibilityProblem:
         """
         require_kind("mpc", mpc, MPC)
         mpc.validate()
+        require_tightened(mpc, "what labels by one sequence of inputs")
         boxes = {name: as_box(getattr(mpc, name)) for name in ("states", "inputs", "terminal_set")}
         hard = with_equalities(replace(mpc, soft=(), input_rate_weight=None, **boxes))
         return cls(hard, make_view(hard, axes, fixed))

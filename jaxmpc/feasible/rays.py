@@ -7,22 +7,19 @@ all half-spaces bring it and the hull of the points together (`close_gap`).
 """
 
 import time
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import numpy as np
 from jax import Array
 from scipy.spatial import KDTree
 
-from jaxmpc.arrays import host_array
-from jaxmpc.checks import fail
 from jaxmpc.feasible import proofs
 from jaxmpc.feasible.candidate_search import cut_of, inputs_of
 from jaxmpc.feasible.condensed_rows import ConstraintRows
 from jaxmpc.feasible.hard_constraints import ExactData
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.proofs import Cut
-from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import record
 from jaxmpc.qp.jax_transformations import own_modes
 from jaxmpc.sets.convex_sets import Polytope
@@ -92,35 +89,6 @@ class Boundary:
         """Return the points and half-spaces of those rays that have them."""
         inside = np.isfinite(self.inner)
         return ProvedBounds.of(self.points[inside], self.w[inside], self)
-
-
-def boundary(
-    mpc: MPC,
-    directions: int | np.ndarray,
-    *,
-    center: np.ndarray | None = None,
-    axes: tuple[int, ...] | None = None,
-    fixed: np.ndarray | None = None,
-) -> Boundary:
-    """Compute exact boundary points and facets of the feasible set of `mpc` along rays.
-
-    directions: a number of rays (equally spaced in 2-D, random in more dimensions) or an array
-    (K, d). center: a feasible point (d,); None: the point with the largest margin. axes, fixed: a
-    slice or projection as in `map_feasible_set`, whose feasible set this is. Raises ValueError
-    where it is empty or flat, or the centre is not inside it.
-    """
-    problem = FeasibilityProblem.of(mpc, axes, fixed)
-    d = problem.dimension
-    if isinstance(directions, int | np.integer):
-        directions = ray_directions(max(int(directions), 0), d)
-    directions = host_array("directions", directions)
-    if directions.ndim != 2 or directions.shape[1] != d or not np.all(np.isfinite(directions)):
-        fail("directions", f"shape {directions.shape}", f"Give finite rays (K, {d}) or a number")
-    if not len(directions) or not np.all(np.any(directions != 0, axis=1)):
-        fail("directions", "holds no ray, or a zero row", "Give at least one direction")
-    if center is not None and (np.shape(center) != (d,) or not np.all(np.isfinite(center))):
-        fail("center", f"{center}", f"Give one finite point ({d},)")
-    return Rays.of(problem, center).cast(directions)
 
 
 def ray_directions(count: int, d: int) -> np.ndarray:
@@ -235,8 +203,26 @@ def leaving(
     return np.where(slope > 0, t, np.inf).min(axis=1, initial=np.inf)
 
 
+class Casting(Protocol):
+    """What sends rays: `Rays`, or those under affine policies."""
+
+    @property
+    def problem(self) -> FeasibilityProblem:
+        """Return the problem."""
+
+    @property
+    def center(self) -> np.ndarray:
+        """Return where the rays begin."""
+
+    def box(self) -> ProvedBounds:
+        """Return the half-spaces of the bounding box."""
+
+    def cast(self, directions: np.ndarray) -> Boundary:
+        """Return the proved ends of rays along directions (K, d)."""
+
+
 def close_gap(
-    rays: Rays, gap: float, rounds: int, most: int = MOST_RAYS, deadline: float = np.inf
+    rays: Casting, gap: float, rounds: int, most: int = MOST_RAYS, deadline: float = np.inf
 ) -> tuple[ProvedBounds, float]:
     """Send rays through the vertices of the outer polytope until the volumes differ by no more than
     `gap`, `most` of them a round, before `deadline` (of `time.monotonic`).

@@ -36,7 +36,7 @@ from jaxmpc.systems.system import LinearSystem, host_matrices
 # Curvature of the cost, relative to its terms, below which a direction of the inputs costs nothing.
 FLAT = 1e-12
 # How inputs answer to disturbances: see `MPC`.
-POLICIES = ("tightened",)
+POLICIES = ("tightened", "affine")
 
 
 class TwoSided:
@@ -172,8 +172,10 @@ class MPC:
     disturbance_matrix E (n, p), None for the identity. policy: how later inputs answer to
     disturbances. "tightened": u_k = v_k + K (x_k − z_k) with z the nominal states of the plan v and
     K = gain (m, n), u = Kx; None: the LQR gain of Q and R. Plans, costs and multipliers are those
-    of z and v, whose rows are tightened by what the disturbance can do (`tightening.py`). Labels of
-    feasible sets are claims about this policy.
+    of z and v, whose rows are tightened by what the disturbance can do (`tightening.py`).
+    "affine": u_k = v_k + Σ_{j<k} M_kj w_j, of which the former are a part; it has the largest
+    feasible set and is for maps, boundaries and polytopes of it. Labels of feasible sets are claims
+    about the policy.
     """
 
     system: LinearSystem
@@ -412,6 +414,8 @@ class MPC:
             require_shape("disturbance_matrix", self.disturbance_matrix, (n, p), "One row a state")
             require_finite("disturbance_matrix", self.disturbance_matrix)
         require_disturbance("disturbance", W, self.disturbances)
+        if self.gain is not None and self.policy == "affine":
+            fail("gain", "given with affine policies, which find their own", "Leave it out")
         if self.gain is not None:
             require_real("gain", self.gain)
             require_shape("gain", self.gain, (m, n), "A gain K with u = v + K (x − z)")

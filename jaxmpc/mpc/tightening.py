@@ -56,6 +56,7 @@ def with_gain(mpc: MPC) -> MPC:
     what programs of JAX can take as an argument. A nominal problem is returned as it is."""
     if mpc.disturbance is None:
         return mpc
+    require_tightened(mpc, "a plan of one sequence of inputs")
     return replace(mpc, gain=feedback_gain(mpc), disturbance=with_vertices(mpc.disturbance))
 
 

@@ -24,7 +24,7 @@ from jaxmpc.batches import default_chunk
 from jaxmpc.checks import fail, whole
 from jaxmpc.explicit.law_at_states import Law, RegionLaw
 from jaxmpc.feasible.plan_polytope import CenteredPolytope
-from jaxmpc.feasible.problem import FeasibilityProblem
+from jaxmpc.feasible.policy_problem import problem_of
 from jaxmpc.grids import grid
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.recursion.counterexamples import (
@@ -119,7 +119,7 @@ def examine(
     settled: float,
 ) -> RecursionReport:
     """Return the report of `recursive_feasibility`; settled: when its stage 1 has to end."""
-    problem = FeasibilityProblem.of(mpc)
+    problem = problem_of(mpc)
     p = problem.dimension
     steps, max_regions = whole("steps", steps, 1), whole("max_regions", max_regions, 0)
     if x0s is not None and mpc.disturbance is not None:
@@ -309,7 +309,7 @@ def smallest_horizon(
         budget.say(f"horizon {N}")
         changed = replace(mpc, horizon=N)
         try:
-            problem = FeasibilityProblem.of(changed)
+            problem = problem_of(changed)
         except ValueError:  # such as more free moves than steps
             continue
         try:

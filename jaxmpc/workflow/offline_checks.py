@@ -13,10 +13,10 @@ from jaxmpc.arrays import Reals
 from jaxmpc.checks import fail, require_kind, whole
 from jaxmpc.closed_loop.simulation import Run, lyapunov_decrease, simulate
 from jaxmpc.explicit.exact_penalties import ExactPenalty, exact_penalty
+from jaxmpc.feasible.boundary_points import boundary
 from jaxmpc.feasible.map import FeasibleSetMap, map_points
 from jaxmpc.feasible.polytope_growth import is_standard_form
 from jaxmpc.feasible.problem import FeasibilityProblem
-from jaxmpc.feasible.rays import boundary
 from jaxmpc.grids import grid
 from jaxmpc.mpc.condense import condensed_in_float64, in_float64
 from jaxmpc.mpc.controller import Controller

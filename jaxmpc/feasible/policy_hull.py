@@ -1,0 +1,340 @@
+"""Labels under affine policies, by the hull of policies that rays have found.
+
+The rows are convex in (θ, v, M) together, so a convex combination of proved triples is a proved
+triple. Rays from the centre end in triples and half-spaces, each proved in rational arithmetic
+(`policy_problem.py`); `close_gap` sends more until hull and half-spaces meet. The hull is divided
+into cones as in `hull_labels.py`: with λ ≥ 0, Σ λ ≤ 1 a point is feasible, and its policy is the
+same combination of those of the centre and of its facet's vertices. Beyond a half-space it is
+infeasible. The few points between get a ray of their own.
+"""
+
+import functools
+import time
+from dataclasses import replace
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from scipy.spatial import QhullError
+
+from jaxmpc.batches import Compiled, Devices, chosen_devices, default_chunk, over_devices, padded
+from jaxmpc.checks import fail
+from jaxmpc.feasible import proofs
+from jaxmpc.feasible.hull_labels import (
+    GAP,
+    MOST_COORDINATES,
+    MOST_RAYS,
+    ROUNDS,
+    Hull,
+    edges_of,
+    hull_facets,
+    largest_row_sum,
+    nearest_cone,
+)
+from jaxmpc.feasible.pipeline import (
+    MOST_PROGRAMS,
+    Labels,
+    OnDemand,
+    compiled_ends,
+)
+from jaxmpc.feasible.policy_problem import HalfSpace, PolicyProblem, rounded
+from jaxmpc.feasible.proofs import Cut, Verdict
+from jaxmpc.feasible.rays import BACKOFFS, Boundary, ProvedBounds, close_gap, leaving
+from jaxmpc.pytrees import record
+from jaxmpc.qp.status import Status
+
+# By label: 0, 1, −1.
+STATUSES = np.array([Status.ITERATION_LIMIT, Status.SOLVED, Status.PRIMAL_INFEASIBLE], np.int8)
+
+
+@record
+class PolicyRays:
+    """Rays from one centre of the feasible set under affine policies, as `rays.Rays`.
+
+    center (d,), with w: a proved triple, (v, M) flattened side by side.
+    """
+
+    problem: PolicyProblem
+    center: np.ndarray
+    w: np.ndarray
+
+    @classmethod
+    def of(cls, problem: PolicyProblem, center: np.ndarray | None = None) -> "PolicyRays":
+        """Return rays from the given centre, or from a point with a margin.
+
+        Raises ValueError where the feasible set is empty or flat, or the centre not inside it.
+        """
+        given = center is not None
+        center, x = problem.programs.center(center)
+        rays = cls(problem, center if given else rounded(center), np.zeros(0))
+        rays = replace(rays, w=rays.flat(x))
+        if not rays.proved(rays.center, rays.w):
+            fail("mpc", "its feasible set is flat: no centre is proved", "Relax a limit")
+        return rays
+
+    @property
+    def reach(self) -> np.ndarray:
+        """Return bounds (d,) of |θ| on the feasible set, ∞ where there are none."""
+        box = self.problem.programs.bounding_box[0]
+        return np.full(len(self.center), np.inf) if box is None else np.abs(box).max(axis=0)
+
+    def flat(self, x: np.ndarray) -> np.ndarray:
+        """Return (v, M) of a point of the lifted rows as one vector."""
+        v, M = self.problem.lifted.policy(x, self.problem.causal)
+        return np.append(v, M)
+
+    def proved(self, theta: np.ndarray, w: np.ndarray) -> bool:
+        """Return whether the triple (θ, v, M) is proved."""
+        v, M = self.parts(w)
+        return self.problem.exact_rows.proves(theta, v, M)
+
+    def parts(self, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return v (…, N m) and M (…, N m, N g) of flattened policies."""
+        shape = self.problem.causal.shape
+        return w[..., : shape[0]], w[..., shape[0] :].reshape(*w.shape[:-1], *shape)
+
+    def box(self) -> ProvedBounds:
+        """Return the half-spaces of the bounding box, those that exist."""
+        none = np.zeros((0, len(self.center))), np.zeros((0, len(self.w)))
+        _, sides = self.problem.programs.bounding_box
+        return ProvedBounds.of(*none, self._boundary(np.zeros((0, len(self.center))), [], sides))
+
+    def cast(self, directions: np.ndarray) -> Boundary:
+        """Return the boundary points along every direction (K, d), moved inwards and proved."""
+        found, multipliers = [], []
+        for direction in directions:
+            t, x, y = self.problem.programs.ray(self.center, direction)
+            found.append(self._end(direction, t, self.flat(x)) if np.isfinite(t) else None)
+            multipliers.append(y)
+        return self._boundary(directions, found, np.array(multipliers))
+
+    def _end(self, direction: np.ndarray, t: float, w: np.ndarray) -> tuple | None:
+        """Return (t, θ, w) of the last triple of a ray that is proved."""
+        for back in BACKOFFS:
+            theta = rounded(self.center + t * (1 - back) * direction)
+            policy = rounded(self.w + (1 - back) * (w - self.w))
+            if self.proved(theta, policy):
+                return t * (1 - back), theta, policy
+        return None
+
+    def _boundary(self, directions: np.ndarray, found: list, multipliers: np.ndarray) -> Boundary:
+        problem, d = self.problem, len(self.center)
+        width = problem.causal.shape[1]
+        each = [problem.lifted.multipliers(y, width) for y in multipliers]
+        cuts = [problem.exact_rows.cut(*parts, problem.causal) for parts in each]
+        cut = HalfSpace(*(np.array(v) for v in zip(*cuts, strict=True)))
+        with np.errstate(invalid="ignore"):
+            extra = np.where(cut.w == 0, 0.0, cut.w * self.reach).sum(axis=1)
+        offsets = np.nextafter(cut.b + extra * (1 + 1e-12), np.inf)
+        none = np.nan, np.full(d, np.nan), np.full(len(self.w), np.nan)
+        ends = [none if end is None else end for end in found]
+        inner, points, w = (np.array(v) for v in zip(*ends, strict=True)) if ends else none
+        return Boundary(
+            center=self.center,
+            directions=directions,
+            inner=np.atleast_1d(inner),
+            outer=leaving(self.center, directions, cut.a, offsets),
+            points=points,
+            w=w,
+            normals=cut.a,
+            offsets=offsets,
+            cuts=Cut(*cut),  # type: ignore[arg-type]
+        )
+
+
+@record
+class PolicyHull:
+    """The cones of proved triples, as a `Hull` with policies for its values, and its rays.
+
+    gap: of the volumes of the hull and of the half-spaces, relative to the latter.
+    """
+
+    rays: PolicyRays
+    hull: Hull
+    bounds: ProvedBounds
+    gap: float
+
+    @classmethod
+    def of(cls, problem: PolicyProblem, gap: float = GAP, deadline: float = np.inf) -> "PolicyHull":
+        """Return the hull of a problem.
+
+        Raises ValueError where its feasible set is empty, flat or unbounded, and in more than
+        `MOST_COORDINATES`."""
+        d = problem.dimension
+        if d > MOST_COORDINATES:
+            cure = 'Give axes and fixed for a slice, or policy="tightened"'
+            fail(
+                "mpc",
+                f"has {d} states; hulls of affine policies have up to {MOST_COORDINATES}",
+                cure,
+            )
+        rays = PolicyRays.of(problem)
+        bounds, left = close_gap(rays, gap, ROUNDS, MOST_RAYS, deadline)
+        unit = np.ptp(bounds.points, axis=0)
+        try:
+            facets = hull_facets((bounds.points - rays.center) / unit)
+        except (QhullError, ValueError):
+            fail("mpc", "its feasible set is flat or unbounded: no hull of policies", "Bound it")
+        theta, w = np.vstack([bounds.points, rays.center]), np.vstack([bounds.w, rays.w])
+        facets = facets[np.linalg.cond(edges_of(theta, facets) / unit[:, None]) < 1e8]
+        M = np.linalg.inv(edges_of(theta, facets))
+        # λ is off by no more than this (see `hull_labels.label_limits`); real λ are all it takes.
+        edges = edges_of(theta, facets)
+        size = largest_row_sum(np.abs(M) @ np.abs(edges))
+        off = 4 * (largest_row_sum(np.eye(d) - M @ edges) + 4 * proofs.gamma(d + 3) * size)
+        gauge, slope = M.sum(axis=1), edges_of(w, facets) @ M
+        _, _, normals, offsets, cuts = bounds
+        hull = Hull(rays.center, M, gauge, off, 1 - d * off, w[-1], slope, normals, offsets, cuts)
+        return cls(rays, hull, bounds, left)
+
+    def policies(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return v (B, N m) and M (B, N m, N g) of feasible points (B, d), for ω as in
+        `policy_problem.py`: combined, or by a ray where no cone holds the point. NaN where there is
+        none."""
+        with jax.enable_x64(True):
+            w, label, *_ = compiled_proofs(None).run(self.hull, points)
+        w, left = np.array(w), np.flatnonzero(np.asarray(label) != 1)
+        if len(left):
+            w[left] = self.by_rays(points[left])[1]
+        return self.rays.parts(w)
+
+    def by_rays(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, Boundary]:
+        """Return which points (K, d) a ray from the centre through each proves feasible, their
+        policies (K, v), NaN for others, and the ends of the rays."""
+        rays, directions = self.rays, points - self.rays.center
+        still = ~np.any(directions != 0, axis=1)
+        ends = rays.cast(np.where(still[:, None], 1.0, directions))
+        reach = np.where(ends.inner >= 1, ends.inner, np.nan)
+        plans = rays.w + np.where(still, 0.0, 1 / reach)[:, None] * (ends.w - rays.w)
+        proved = [
+            not np.isnan(plan).any() and rays.proved(point, plan)
+            for point, plan in zip(points, plans, strict=True)
+        ]
+        return np.array(proved), np.where(np.array(proved)[:, None], plans, np.nan), ends
+
+
+def label(hull: Hull, theta: Array) -> tuple[Array, Array, Array]:
+    """Return the label of θ (d,), 0 where it is left to a ray, its cone, and its half-space."""
+    cone, facet = nearest_cone(hull, theta)
+    if theta.shape[0] > 2:  # of facets in one plane, that of the cone which holds θ
+        cone = holding_cone(hull, theta)
+    share = jnp.sum(hull.M[cone] * (theta - hull.center), axis=1)
+    inside = jnp.all(share >= hull.least[cone]) & (jnp.sum(share) <= hull.most[cone])
+    a, b, w = (v[facet] for v in hull.cuts)
+    outside = proofs.excludes(a, b, w, theta)
+    return jnp.where(inside, 1, jnp.where(outside, -1, 0)).astype(jnp.int8), cone, facet
+
+
+def holding_cone(hull: Hull, theta: Array) -> Array:
+    """Return the index of the cone in which the least λ_i of θ is largest. One cone after the
+    other, as in `hull_labels.index_of_largest`."""
+    x = theta - hull.center
+
+    def better(best: tuple[Array, Array], cone: tuple) -> tuple[Any, None]:
+        value, index = best
+        M, i = cone
+        rows = [sum(M[r, j] * x[j] for j in range(x.shape[0])) for r in range(x.shape[0])]
+        here = functools.reduce(jnp.minimum, rows)
+        return (jnp.maximum(value, here), jnp.where(here > value, i, index)), None
+
+    count = jnp.arange(len(hull.M), dtype=jnp.int32)
+    begin = jnp.asarray(-jnp.inf, theta.dtype), jnp.int32(0)
+    return jax.lax.scan(better, begin, (hull.M, count))[0][1]
+
+
+@functools.cache
+def compiled_policy_labels(devices: Devices) -> Compiled:
+    """Return the compiled labels: (hull, points (B, d)) → labels (B,)."""
+    one = lambda hull, theta: label(hull, theta)[0]
+    return over_devices(jax.vmap(one, in_axes=(None, 0)), devices, (False, True))
+
+
+_made: WeakKeyDictionary[PolicyProblem, PolicyHull] = WeakKeyDictionary()
+
+
+def policy_hull(problem: PolicyProblem) -> PolicyHull:
+    """Return the hull of a problem, made once."""
+    if problem not in _made:
+        _made[problem] = PolicyHull.of(problem)
+    return _made[problem]
+
+
+def policy_labels(
+    problem: PolicyProblem, points: np.ndarray, chunk: int | None = None, devices: Any = None
+) -> Labels:
+    """Return the labels of points (B, d), not finite ones too, with their proofs: the plan v of the
+    policy, or a half-space. Raises ValueError as `PolicyHull.of` does."""
+    found = policy_hull(problem)
+    begun, compiled = time.perf_counter(), Compiled.seconds
+    chosen = chosen_devices(devices)
+    chunk = min(chunk or default_chunk(64), max(len(points), 1))
+    prepare, ends = compiled_ends(chosen)
+    parts: list[Any] = [(np.zeros(0, np.int8), np.zeros(0, np.int8))]
+    with jax.enable_x64(True):
+        for first in range(0, len(points), chunk):
+            part = points[first : first + chunk]
+            full = part if len(part) == chunk else padded(part, chunk)
+            x, usable = prepare.run(full)
+            done = ends.run(compiled_policy_labels(chosen).run(found.hull, x), usable)
+            parts.append(tuple(np.asarray(v)[: len(part)] for v in done))
+    label, status = (np.concatenate(v) for v in zip(*parts, strict=True))
+    verdict = OnDemand(functools.partial(_verdicts, found, points, label, chosen))
+    labels = Labels.proved(label, status, verdict.get)
+    left = labels.undecided[:MOST_PROGRAMS]
+    if len(left):
+        labels = _by_rays(found, labels, points, left)
+    compile_seconds = Compiled.seconds - compiled
+    run_seconds = time.perf_counter() - begun - compile_seconds
+    return replace(labels, compile_seconds=compile_seconds, run_seconds=run_seconds)
+
+
+def _verdicts(found: PolicyHull, x: np.ndarray, label: np.ndarray, devices: Devices) -> Verdict:
+    """Return the verdicts on points (B, d): plans v, and half-spaces; nothing for others."""
+    x = np.where(np.isfinite(x).all(axis=1)[:, None], x, 0.0)
+    with jax.enable_x64(True):
+        plan, _, normal, offset = compiled_proofs(devices).run(found.hull, x)
+    problem = found.rays.problem
+    N, m = problem.mpc.horizon, problem.mpc.system.m
+    start = problem.view.states(x)
+    plan = np.asarray(plan)[:, : N * m].reshape(len(x), N, m)
+    parts: Any = label, start, plan, normal, offset
+    return Verdict(*parts)
+
+
+@functools.cache
+def compiled_proofs(devices: Devices) -> Compiled:
+    """Return the compiled proofs: (hull, points (B, d)) → values, labels, normals and offsets."""
+
+    def one(hull: Hull, theta: Array) -> tuple[Array, Array, Array, Array]:
+        found, cone, facet = label(hull, theta)
+        value = hull.value + jnp.sum(hull.slope[cone] * (theta - hull.center), axis=1)
+        normal, offset = hull.normals[facet], hull.offsets[facet]
+        beyond = proofs.excludes(normal, offset, jnp.zeros_like(normal), theta)
+        return value, found, normal, jnp.where(beyond, offset, jnp.inf)
+
+    return over_devices(jax.vmap(one, in_axes=(None, 0)), devices, (False, True))
+
+
+def _by_rays(found: PolicyHull, labels: Labels, x: np.ndarray, left: np.ndarray) -> Labels:
+    """Return the labels where a ray from the centre through each point that is left decides."""
+    points, problem = x[left], found.rays.problem
+    inside, plans, ends = found.by_rays(points)
+    a, b, w = ends.cuts
+    with jax.enable_x64(True):
+        outside = np.asarray(proofs.excludes(*map(jnp.asarray, (a, b, w, points))))
+    label = np.where(inside, 1, np.where(outside, -1, 0)).astype(np.int8)
+    N, m = problem.mpc.horizon, problem.mpc.system.m
+    beyond = np.sum(a * points, axis=1) > ends.offsets
+    parts: Any = (
+        label,
+        problem.view.states(points),
+        plans[:, : N * m].reshape(len(points), N, m),
+        a,
+        np.where(beyond, ends.offsets, np.inf),
+    )
+    verdict = Verdict(*parts)
+    more = Labels.proved(label, STATUSES[label], lambda: verdict)
+    return labels.changed(left, more.label, more.status, more.proofs)

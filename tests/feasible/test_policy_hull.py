@@ -1,0 +1,221 @@
+"""Affine policies: labels against all vertex sequences, and against a linear program of another
+formulation (SciPy) over policies."""
+
+import itertools
+
+import numpy as np
+import pytest
+from scipy.optimize import linprog
+
+import jaxmpc as jm
+from jaxmpc.feasible import boundary, feasible_polytope
+from jaxmpc.feasible.policy_hull import policy_hull
+from jaxmpc.feasible.policy_problem import problem_of
+
+A, B = np.array([[1.0, 1.0], [0.0, 1.0]]), np.array([[0.5], [1.0]])
+SYSTEM = jm.LinearSystem(A, B)
+X, U = jm.Box([-5.0, -2.0], [5.0, 2.0]), jm.Box([-1.0], [1.0])
+W = jm.Box([-0.2, -0.2], [0.2, 0.2])
+K = np.asarray(jm.lqr(SYSTEM, np.eye(2), 0.1).K)
+
+
+def double(**fields) -> jm.MPC:
+    last = jm.maximal_invariant_set(SYSTEM, K, X, U, disturbance=W)
+    given = {"system": SYSTEM, "Q": np.eye(2), "R": 0.1, "horizon": 5, "states": X, "inputs": U}
+    given |= {"terminal_set": last, "disturbance": W, "policy": "affine"}
+    return jm.MPC(**{**given, **fields})
+
+
+def random_problem(seed: int) -> jm.MPC:
+    """Return a small problem of any kind: n ≤ 3, N ≤ 4, one or two disturbances off centre."""
+    rng = np.random.default_rng(seed)
+    n, m, N, p = rng.integers(1, 4), rng.integers(1, 3), rng.integers(1, 5), rng.integers(1, 3)
+    A, B, c = 0.7 * rng.normal(size=(n, n)), rng.normal(size=(n, m)), 0.05 * rng.normal(size=n)
+    system = jm.LinearSystem(A, B, c)
+    low, high = -rng.uniform(0, 0.25, p), rng.uniform(0.01, 0.25, p)
+    return jm.MPC(
+        system, np.eye(n), np.eye(m), int(N),
+        states=jm.Box(-rng.uniform(1, 2, n), rng.uniform(1, 2, n)),
+        inputs=jm.Box(-rng.uniform(0.5, 1, m), rng.uniform(0.5, 1, m)), policy="affine",
+        disturbance=jm.Box(low, high), disturbance_matrix=rng.normal(size=(n, p)),
+        terminal_set=jm.Box(-np.ones(n), np.ones(n)),
+    )  # fmt: skip
+
+
+def worst_by_sequences(mpc: jm.MPC, x0: np.ndarray, v: np.ndarray, M: np.ndarray) -> float:
+    """Return by how much the policy u = v + M ω breaks a limit, over all vertex sequences."""
+    N, (n, m) = mpc.horizon, mpc.system.B.shape
+    low, high = np.asarray(mpc.disturbance.lower), np.asarray(mpc.disturbance.upper)
+    E = np.eye(n) if mpc.disturbance_matrix is None else np.asarray(mpc.disturbance_matrix)
+    signs = np.array(list(itertools.product([-1.0, 1.0], repeat=N * len(low))))
+    w = (low + high) / 2 + signs.reshape(-1, N, len(low)) * (high - low) / 2
+    u = (v + signs @ M.T).reshape(-1, N, m)
+    x, worst = np.tile(x0, (len(w), 1)), -np.inf
+    c = 0.0 if mpc.system.c is None else np.asarray(mpc.system.c)
+    for k in range(N + 1):
+        set_ = mpc.states if k < N else mpc.terminal_set
+        H, h = set_.half_spaces()
+        worst = max(worst, np.max(x @ H.T - h))
+        if k < N:
+            H, h = mpc.inputs.half_spaces()
+            worst = max(worst, np.max(u[:, k] @ H.T - h))
+            x = (
+                x @ np.asarray(mpc.system.A).T
+                + u[:, k] @ np.asarray(mpc.system.B).T
+                + c
+                + w[:, k] @ E.T
+            )
+    return worst
+
+
+def least_violation(mpc: jm.MPC, x0: np.ndarray) -> float:
+    """Return the least violation over all affine policies, by a program with a row for each vertex
+    sequence and limit: no supports, no duals."""
+    N, (n, m) = mpc.horizon, mpc.system.B.shape
+    low, high = np.asarray(mpc.disturbance.lower), np.asarray(mpc.disturbance.upper)
+    E = np.eye(n) if mpc.disturbance_matrix is None else np.asarray(mpc.disturbance_matrix)
+    c = np.zeros(n) if mpc.system.c is None else np.asarray(mpc.system.c)
+    p, A, B = len(low), np.asarray(mpc.system.A), np.asarray(mpc.system.B)
+    entries = [(k, j) for k in range(N) for j in range(k)]
+    total = N * m + len(entries) * m * p
+    rows, bounds = [], []
+    for w in itertools.product(itertools.product(*zip(low, high, strict=True)), repeat=N):
+        gain, x = np.zeros((n, total)), np.array(x0)
+        for k in range(N + 1):
+            set_ = mpc.states if k < N else mpc.terminal_set
+            H, h = set_.half_spaces()
+            rows.append(H @ gain)
+            bounds.append(h - H @ x)
+            if k == N:
+                break
+            u = np.zeros((m, total))
+            u[:, k * m : (k + 1) * m] = np.eye(m)
+            for e, (i, j) in enumerate(entries):
+                if i == k:
+                    at = N * m + e * m * p
+                    u[:, at : at + m * p] = np.kron(np.eye(m), np.asarray(w[j]))
+            H, h = mpc.inputs.half_spaces()
+            rows.append(H @ u)
+            bounds.append(h)
+            gain, x = A @ gain + B @ u, A @ x + c + E @ np.asarray(w[k])
+    G, g = np.vstack(rows), np.concatenate(bounds)
+    found = linprog(
+        np.eye(total + 1)[-1], np.column_stack([G, -np.ones(len(g))]), g, bounds=(None, None)
+    )
+    return found.fun if found.status == 0 else -np.inf
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_no_label_is_wrong(seed):
+    """States labelled feasible keep all limits under every sequence by the policy that is given;
+    for those nearest to the boundary that are labelled infeasible, no policy exists."""
+    mpc = random_problem(seed)
+    problem = problem_of(mpc)
+    rng = np.random.default_rng(seed)
+    try:
+        hull = policy_hull(problem)
+    except ValueError as error:
+        assert "empty or flat" in str(error)
+        assert all(least_violation(mpc, x) > -1e-7 for x in rng.uniform(-1, 1, (5, mpc.system.n)))
+        return
+    points = rng.uniform(-2, 2, (400, mpc.system.n))
+    found = jm.map_feasible_set(problem, points)
+    assert found.counts()["undecided"] == 0
+    inside = points[found.label == 1][:40]
+    for x0, v, M in zip(inside, *hull.policies(inside), strict=True):
+        assert worst_by_sequences(mpc, x0, v, M) <= 1e-9
+    outside = np.flatnonzero(found.label == -1)
+    beyond = np.sum(found.labels.cut_normal * points, axis=1) - found.labels.cut_offset
+    size = np.linalg.norm(found.labels.cut_normal, axis=1)
+    assert np.all(beyond[outside] > 0)
+    for i in outside[np.argsort((beyond / size)[outside])][:4]:
+        assert least_violation(mpc, points[i]) > 0
+
+
+def test_the_double_integrator_of_the_literature():
+    """Area of the exact set by dynamic programming (`predecessor`), by rays, and as a polytope."""
+    mpc = double()
+    exact = mpc.terminal_set
+    for _ in range(5):
+        exact = jm.sets.predecessor(SYSTEM, exact, X, U, W)
+    np.testing.assert_allclose(exact.volume(), 35.7903, atol=5e-5)
+    found = feasible_polytope(mpc)
+    assert found.is_subset(exact, 1e-7)
+    np.testing.assert_allclose(found.volume(), 35.7903, atol=1e-4)
+    hull = policy_hull(problem_of(mpc))
+    assert hull.gap < 1e-9
+    ends = boundary(mpc, 5)
+    assert np.all(ends.inner > 0) and np.all(ends.outer - ends.inner < 1e-9 * ends.outer)
+    tightened = feasible_polytope(double(policy="tightened"))
+    assert tightened.is_subset(found) and tightened.volume() < 0.979 * found.volume()
+
+
+def test_all_sequences_of_combined_policies():
+    mpc = double()
+    problem = problem_of(mpc)
+    points = np.random.default_rng(0).uniform([-5, -2], [5, 2], (300, 2))
+    found = jm.map_feasible_set(problem, points)
+    inside = points[found.label == 1][:60]
+    v, M = policy_hull(problem).policies(inside)
+    assert max(worst_by_sequences(mpc, *each) for each in zip(inside, v, M, strict=True)) <= 1e-11
+    plans = found.labels.plan[found.label == 1][:60]
+    np.testing.assert_allclose(plans[:, :, 0], v, atol=1e-12)
+
+
+def test_one_step_and_no_disturbance():
+    """N = 1: the one-step controllable set. W = {0}: the nominal set."""
+    one = feasible_polytope(double(horizon=1))
+    expected = jm.sets.predecessor(SYSTEM, double().terminal_set, X, U, W)
+    assert one.is_subset(expected, 1e-8) and expected.is_subset(one, 1e-8)
+    zero = feasible_polytope(double(disturbance=jm.Box(0.0, 0.0), horizon=3))
+    nominal = feasible_polytope(
+        jm.MPC(SYSTEM, np.eye(2), 0.1, 3, X, U, terminal_set=double().terminal_set)
+    )
+    assert zero.is_subset(nominal, 1e-8) and nominal.is_subset(zero, 1e-8)
+
+
+def test_slices_and_recursion():
+    mpc = double(horizon=3)
+    found = jm.map_feasible_set(
+        mpc, np.linspace(-1.99, 2.01, 41)[:, None], axes=[1], fixed=[3.0, 0.0]
+    )
+    whole = feasible_polytope(mpc)
+    expected = [bool(whole.contains(np.array([3.0, y]))) for y in found.x0s[:, 0]]
+    np.testing.assert_array_equal(found.label == 1, expected)
+    report = jm.recursive_feasibility(mpc)
+    assert report.strong.holds and "all disturbances" in report.strong.reason
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"control_horizon": 2}, "control_horizon: given with affine policies"),
+        ({"input_rate_limit": 1.0}, "input_rate_limit: given with affine policies"),
+        ({"inputs": None}, "inputs: are in no bounded Box"),
+        ({"gain": K}, "gain: given with affine policies"),
+        ({"disturbance": W.to_polytope()}, "affine policies answer to generators"),
+        ({"disturbance": jm.sets.Zonotope([0, 0], np.ones((2, 3)))}, "depend on each other"),
+        ({"terminal_set": jm.Box([2.0, -2.0], [5.0, -1.9])}, "is empty or flat"),
+    ],
+)
+def test_refusals(fields, message):
+    with pytest.raises(ValueError, match=message):
+        jm.map_feasible_set(double(**fields), np.zeros((1, 2)))
+
+
+def test_what_takes_one_sequence_refuses_affine_policies():
+    mpc = double()
+    for call in (
+        lambda: jm.solve(mpc, np.zeros(2)),
+        lambda: jm.Controller(mpc),
+        lambda: jm.solve_many(mpc, np.zeros((1, 2))),
+        lambda: jm.explicit.critical_regions(mpc),
+        lambda: jm.explicit.exact_penalty(mpc),
+        lambda: jm.feasible.feasible_fraction(mpc, np.zeros((1, 2))),
+        lambda: jm.feasible.sweep_into("nowhere", mpc, [np.zeros(2)] * 2),
+        lambda: jm.mpc.row_table(mpc),
+    ):
+        with pytest.raises(ValueError, match="policy: 'affine'"):
+            call()
+    with pytest.raises(ValueError, match="give a projection"):
+        jm.map_feasible_set(mpc, np.zeros((1, 1)), axes=[0])
