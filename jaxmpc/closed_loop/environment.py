@@ -11,7 +11,7 @@ from jaxmpc.arrays import Reals, as_weight
 from jaxmpc.checks import number, require_kind, require_shape, whole
 from jaxmpc.closed_loop.feedback import Feedback, model_of
 from jaxmpc.closed_loop.robot_controller import robot_mpc
-from jaxmpc.closed_loop.variations import start_room
+from jaxmpc.closed_loop.variations import free_motions, start_room
 from jaxmpc.mpc.plan import limited
 from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.linalg import matmul
@@ -59,8 +59,9 @@ class Environment:
     robot: a Robot or LinearPlant; `replace(environment, robot=robot.vary(...))` has another plant,
     a batch of them under `jax.vmap`. reference r (n,), input_reference s (m,): the target, at rest.
     Q (n, n), R (m, m). home (n,), below (n,), above (n,): coordinates of starts are uniform in
-    [home − below, home + above]. length: steps of an episode. stop_at_limits: whether it ends where
-    a state limit is exceeded. A pytree.
+    [home − below, home + above], projected by motions (n, n) onto those that keep the couplings of
+    the file to first order (None: there are none). length: steps of an episode. stop_at_limits:
+    whether it ends where a state limit is exceeded. A pytree.
     """
 
     robot: Any
@@ -71,7 +72,8 @@ class Environment:
     home: Any
     below: Any
     above: Any
-    length: int = static()
+    motions: Any = None
+    length: int = static(default=200)
     stop_at_limits: bool = static(default=False)
 
     @classmethod
@@ -105,15 +107,15 @@ class Environment:
         home, below, above = start_room(robot)
         room = (home, spread * below, spread * above)
         reference = host_coordinates(robot, x)
-        return cls(robot, reference, u, Q, R, *room, length, stop_at_limits)
+        motions = free_motions(robot)
+        return cls(robot, reference, u, Q, R, *room, motions, length, stop_at_limits)
 
     def reset(self, key: Array) -> EnvironmentState:
         """Return a random start."""
         aside = jax.random.uniform(key, (self.robot.n,), minval=-1.0, maxval=1.0)
         room = jnp.where(aside > 0, jnp.asarray(self.above), jnp.asarray(self.below))
-        return self.at(
-            self.robot.state((jnp.asarray(self.home) + room * aside).astype(aside.dtype))
-        )
+        start = room * aside if self.motions is None else matmul(self.motions, room * aside)
+        return self.at(self.robot.state((jnp.asarray(self.home) + start).astype(aside.dtype)))
 
     def at(self, x: Any) -> EnvironmentState:
         """Return the start of an episode at the state x (nq + nv,)."""

@@ -6,8 +6,10 @@ from typing import Any
 
 import jax
 import numpy as np
+from scipy.linalg import block_diag
 
 from jaxmpc.checks import fail, nearest, require_kind, require_shape, whole
+from jaxmpc.robots.couplings import Couplings
 from jaxmpc.robots.description import host_coordinates
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.mujoco_access import names, number_of
@@ -63,7 +65,8 @@ def draw_robots(
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Draw starts (count, nq + nv) and the factors by which each plant differs from the model.
 
-    spread: largest fraction of the way from home to the limits. mass, damping: factors are from
+    spread: largest fraction of the way from home to the limits; the states nearest to such random
+    ones that keep the couplings of the file. mass, damping: factors are from
     1 − this to 1 + this; payload: masses in kg are from 0 to this. The dictionary has those that
     are not zero: "mass" (count, bodies), "damping" (count, nv), "payload" (count,).
     """
@@ -72,6 +75,7 @@ def draw_robots(
     aside = spread * starts.uniform(-1, 1, (count, robot.n))
     with jax.enable_x64(True):
         x0s = np.asarray(jax.vmap(robot.state)(home + np.where(aside > 0, above, below) * aside))
+    x0s = Couplings(robot.predictor.model).kept(x0s)
     ranges = {"mass": (1 - mass, 1 + mass), "damping": (1 - damping, 1 + damping)}
     ranges = {name: range_ for name, range_ in ranges.items() if range_[1] > 1}
     if payload:
@@ -163,3 +167,15 @@ def start_room(robot: Robot | LinearPlant) -> tuple[np.ndarray, np.ndarray, np.n
         np.where(np.isfinite(end), np.abs(end - home), 1.0) for end in robot.state_limits.bounds()
     )
     return home, below, above
+
+
+def free_motions(robot: Robot | LinearPlant) -> np.ndarray | None:
+    """Return the projector (n, n) of coordinates onto those that keep couplings at home to first
+    order; None where there are none."""
+    if isinstance(robot, LinearPlant):
+        return None
+    couplings, nv = Couplings(robot.predictor.model), robot.mujoco.nv
+    if not couplings.there:
+        return None
+    motions = couplings.motions(np.asarray(robot.home[: robot.mujoco.nq], float))
+    return np.asarray(block_diag(motions, motions, np.eye(robot.n - 2 * nv)))

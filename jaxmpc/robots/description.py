@@ -14,7 +14,7 @@ from jaxmpc.checks import fail, require_finite, require_shape
 from jaxmpc.pytrees import record, static
 from jaxmpc.qp.linalg import floating_dtype
 from jaxmpc.robots.configurations import difference, quaternions, retract, unit_orientations
-from jaxmpc.robots.mujoco_access import acts, equalities, mjx_module, mujoco, single_joints, word
+from jaxmpc.robots.mujoco_access import acts, mjx_module, mujoco, single_joints, word
 from jaxmpc.robots.physics import Physics
 from jaxmpc.sets.convex_sets import Box
 
@@ -210,8 +210,6 @@ def _ignored(model: "mujoco.MjModel") -> tuple[str, ...]:
     counts: Counter[str] = Counter()
     if acts(model, "contact"):
         counts["pairs of shapes in contact"] = sum(1 for _ in collision_driver.geom_pairs(model))
-    for kind in equalities(model):
-        counts[f"equalities of type {kind}"] += 1
     if acts(model, "frictionloss"):
         counts["joints with dry friction"] = np.sum(model.dof_frictionloss > 0)
         counts["tendons with dry friction"] = np.sum(model.tendon_frictionloss > 0)

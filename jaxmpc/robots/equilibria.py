@@ -1,7 +1,7 @@
 """Robots at rest: which inputs hold a configuration, and which configuration nearby can be held.
 
 Computed outside JAX in float64 by MuJoCo's C engine, on the predictor: the springs of limits,
-contacts, equalities and dry friction do not help. What was found is tried on the file.
+contacts and dry friction do not help. What was found is tried on the file.
 """
 
 import copy
@@ -12,6 +12,7 @@ from scipy.optimize import least_squares, lsq_linear
 from jaxmpc.checks import fail
 from jaxmpc.pytrees import record
 from jaxmpc.robots.configurations import blocks
+from jaxmpc.robots.couplings import Couplings, equality_jacobian, projector
 from jaxmpc.robots.description import RobotDescription
 from jaxmpc.robots.mujoco_access import flag, mujoco, name_of, single_joints
 from jaxmpc.sets.convex_sets import Box
@@ -23,6 +24,8 @@ AT_REST = 1e-3
 # Weights of the distance in the search, one after the other; the last leaves balanced forces.
 _WEIGHTS = (1e-2, 1e-4, 1e-6, 1e-9, 1e-12)
 _STEP = 1e-6
+# Steps of Newton's method for the springs of couplings, and accelerations at which it ends.
+_SETTLING, _SETTLED = 10, 1e-9
 
 
 @record
@@ -72,8 +75,12 @@ class Forces:
     """
 
     def __init__(self, robot: RobotDescription) -> None:
-        self.model = model = robot.predictor.model
-        self.data = mujoco.MjData(model)
+        model = robot.predictor.model
+        self.couplings = Couplings(model)
+        if self.couplings.there:
+            model = copy.deepcopy(model)
+            model.opt.tolerance, model.opt.iterations = 0.0, 200
+        self.model, self.data = model, mujoco.MjData(model)
         self.active = np.flatnonzero(model.actuator_dyntype != mujoco.mjtDyn.mjDYN_NONE)
         self.integrators = model.actuator_dyntype == mujoco.mjtDyn.mjDYN_INTEGRATOR
         lower, upper = robot.input_limits.bounds()
@@ -91,13 +98,51 @@ class Forces:
         return np.where(self.integrators, 0.0, drive), act
 
     def at(self, q: np.ndarray, drive: np.ndarray, v: np.ndarray | float = 0.0) -> np.ndarray:
-        """Return the sum (nv,) of all forces, at rest or at the velocity v (nv,)."""
+        """Return the sum (nv,) of all forces, at rest or at the velocity v (nv,), but of those that
+        couplings take."""
         self.data.qpos, self.data.qvel = q, v
         self.data.ctrl, act = self.parts(drive)
         if len(act):
             self.data.act = act
         mujoco.mj_forward(self.model, self.data)
-        return self.data.qfrc_smooth.copy()
+        return self.uncoupled(self.data.qfrc_smooth)
+
+    def uncoupled(self, force: np.ndarray) -> np.ndarray:
+        """Return the part (nv,) of generalised forces, at the position in `data`, that couplings do
+        not balance."""
+        if not self.couplings.there:
+            return force.copy()
+        return projector(equality_jacobian(self.model, self.data)) @ force
+
+    def settled(self, q: np.ndarray, drive: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the configuration next to q in which couplings carry their load, for their springs
+        yield a little, and the drive that balances the rest there.
+
+        Newton's method on the accelerations, in the motions that couplings resist and the drive.
+        """
+        G = self.couplings.rows(q)[1]
+        basis = np.vstack([G.T, np.zeros((self.m, len(G)))])
+        basis = np.hstack([basis, np.eye(len(basis), self.m, -self.model.nv)])
+
+        def moved(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            motion, change = np.split(basis @ z, [self.model.nv])
+            position = q.copy()
+            mujoco.mj_integratePos(self.model, position, motion, 1.0)
+            return position, drive + change
+
+        def accelerations(z: np.ndarray) -> np.ndarray:
+            self.at(*moved(z))
+            return self.data.qacc.copy()
+
+        z = np.zeros(basis.shape[1])
+        steps = _STEP * np.eye(len(z))
+        for _ in range(_SETTLING):
+            a = accelerations(z)
+            if np.abs(a).max() < _SETTLED:
+                break
+            slope = [(accelerations(z + e) - accelerations(z - e)) / (2 * _STEP) for e in steps]
+            z = z - np.linalg.lstsq(np.array(slope).T, a, rcond=1e-9)[0]
+        return moved(z)
 
     def affine(self, q: np.ndarray, v: np.ndarray | float = 0.0) -> tuple[np.ndarray, np.ndarray]:
         """Return J (nv, m) and f (nv,) of the sum of forces J drive + f."""
@@ -107,6 +152,10 @@ class Forces:
     def rest(self, q: np.ndarray, drive: np.ndarray, f: np.ndarray) -> Rest:
         """Return the rest at q under a drive; f (nv,), the forces without any."""
         size, missing = 1 + float(np.abs(f).max()), self.at(q, drive)
+        if self.couplings.there and np.all(np.abs(missing) <= BALANCED * size):
+            q, drive = self.settled(q, drive)
+            self.at(q, drive)
+            missing = self.data.qfrc_smooth + self.data.qfrc_constraint
         return Rest(q, *self.parts(drive), drive, self.lower, self.upper, missing, size)
 
 
@@ -114,6 +163,7 @@ def rest_at(robot: RobotDescription, q: np.ndarray, *, within: bool = False) -> 
     """Return the robot at rest in q (nq,) under the drive that comes nearest to a balance: the
     least one of all inputs, or one within the limits."""
     forces = Forces(robot)
+    q, _ = forces.couplings.met(q)
     J, f = forces.affine(q)
     drive = np.linalg.lstsq(J, -f, rcond=None)[0]
     if within and np.any((drive < forces.lower) | (drive > forces.upper)):
@@ -130,11 +180,6 @@ CAUSES = (
         "",
         "limits of actuators' forces (forcerange, actuatorfrcrange)",
         "Choose a configuration that needs less force, or widen them in the file",
-    ),
-    (
-        "equality",
-        "couplings (equalities), which linear models lack",
-        "Choose a configuration that meets them without their force, or take them out of the file",
     ),
     ("contact", "contacts", "Choose a configuration in which nothing touches"),
     ("limit", "stops of joints or tendons", "Choose a configuration inside their ranges"),
@@ -265,6 +310,12 @@ class Neighbourhood:
         """Return the sum (nv,) of all forces."""
         return self.forces.at(self.position(z), z[self.forces.model.nv :])
 
+    def balance(self, z: np.ndarray) -> np.ndarray:
+        """Return the sum of forces over their size, and how far couplings are from being met."""
+        force = self.force(z) / self.size
+        couplings = self.forces.couplings
+        return np.append(force, couplings.rows(self.position(z))[0]) if couplings.there else force
+
     def scales(self, weight: float) -> np.ndarray:
         """Return the roots of the weights of z. Drives weigh next to nothing: of many that hold q,
         a small one."""
@@ -273,14 +324,15 @@ class Neighbourhood:
 
     def residual(self, z: np.ndarray, weight: float) -> np.ndarray:
         """Return what is to be small, in the sum of its squares."""
-        return np.concatenate([self.force(z) / self.size, self.scales(weight) * z])
+        return np.concatenate([self.balance(z), self.scales(weight) * z])
 
     def jacobian(self, z: np.ndarray, weight: float) -> np.ndarray:
         """Return the derivative of `residual`, by central differences in the motion."""
         steps = _STEP * np.eye(len(z))[: self.forces.model.nv]
-        by_motion = [(self.force(z + e) - self.force(z - e)) / (2 * _STEP) for e in steps]
-        by_drive, _ = self.forces.affine(self.position(z))
-        top = np.hstack([np.array(by_motion).T, by_drive]) / self.size
+        by_motion = [(self.balance(z + e) - self.balance(z - e)) / (2 * _STEP) for e in steps]
+        by_drive = self.forces.affine(self.position(z))[0] / self.size
+        unmoved = np.zeros((len(by_motion[0]) - len(by_drive), by_drive.shape[1]))
+        top = np.hstack([np.array(by_motion).T, np.vstack([by_drive, unmoved])])
         return np.vstack([top, np.diag(self.scales(weight))])
 
 
@@ -337,6 +389,6 @@ def inverse_actuation(
     forces, inertial = Forces(robot), np.zeros(len(a))
     J, f = forces.affine(q, v)
     mujoco.mj_mulM(forces.model, forces.data, inertial, a)
-    needed = inertial - f
+    needed = forces.uncoupled(inertial) - f
     u = np.linalg.lstsq(J, needed, rcond=None)[0]
     return u, np.abs(J @ u - needed), 1 + np.abs(needed).max()

@@ -91,6 +91,8 @@ def force_limits(robot: RobotDescription, x: Any, u: Any) -> ForceLimits | None:
     units += ["N" if model.jnt_type[i] == SLIDE else "N m" for i in joints]
     units += ["N"] * len(tendons)
     moved = slope.any(axis=1)  # what nothing moves is no limit of a plan
+    if not moved.any():
+        return None
     text = lambda values: tuple(value for value, yes in zip(values, moved, strict=True) if yes)
     return ForceLimits(
         slope[moved, :n],

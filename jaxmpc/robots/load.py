@@ -5,7 +5,6 @@ import hashlib
 import re
 import warnings
 import xml.etree.ElementTree as ElementTree
-from collections import Counter
 from importlib import resources
 from importlib.metadata import version
 from pathlib import Path
@@ -55,9 +54,10 @@ def load_robot(
 
     Arguments:
         model: "joint" (one hinge), "pendulum", "cartpole", "arm2", "arm6" (UR5e), "arm7" (Franka
-            FER), "quadrotor" (Crazyflie 2), or a path. A URDF gets a motor for each joint
-            with its `effort` as limit, its `velocity` limits are read (0 of either: none), and its
-            shapes are left out: it must give inertias, has no contacts, needs no mesh files.
+            FER), "quadrotor" (Crazyflie 2), or a path. A URDF gets a motor for each joint that
+            mimics no other, with its `effort` as limit, its `velocity` limits are read (0 of
+            either: none), and its shapes are left out: it must give inertias, has no contacts,
+            needs no mesh files.
         position, velocity, torque: limits in place of the file's, as `joint_limits` takes them:
             (lower, upper), each a number or one a dof (torque: one an actuator), or v for
             |.| ≤ v, inputs in units of ctrl. They bind the controller; the joint stops of the plant
@@ -83,7 +83,7 @@ def load_robot(
     sensors), else with a UserWarning (contacts between shapes for which it has no function, noslip
     iterations, powers of damping, armature and delay of actuators, adhesion). Short motions of the
     plant are then compared with those of the file in MuJoCo's C engine, and a UserWarning names the
-    joints, actuators and tendons that move otherwise, and couplings, which linear models lack.
+    joints, actuators and tendons that move otherwise.
     `robot.report()` lists all of it, and what acts in the plant but not in linear models.
 
     Raises ValueError for files that MuJoCo cannot read, models without actuators or joints, what
@@ -105,7 +105,8 @@ def load_robot(
     limits = overridden("torque", inputs, torque, slice(None))
     input_sources = input_sources if torque is None else ["argument"] * host.nu
     smooth = copy.deepcopy(host)
-    smooth.opt.disableflags |= flag("constraint")
+    for kind in ("contact", "limit", "frictionloss") if equalities(host) else ("constraint",):
+        smooth.opt.disableflags |= flag(kind)
     smooth.actuator_forcelimited[:] = 0
     smooth.jnt_actfrclimited[:] = 0
     smooth.tendon_actfrclimited[:] = 0
@@ -227,10 +228,6 @@ def _warn_of_differences(
         texts.append(f"moves without {'; '.join(without)} of its file, which MJX lacks")
     if unlike:
         texts.append(f"moves otherwise than its file says: {'; '.join(unlike)}")
-    kinds = Counter(equalities(host))
-    if kinds:
-        coupled = ", ".join(f"{count} of type {kind}" for kind, count in kinds.items())
-        texts.append(f"has couplings that its linear models lack ({coupled})")
     if texts:
         warnings.warn(f"robot {name} {', and '.join(texts)}", stacklevel=3)
 
@@ -511,7 +508,12 @@ def compiled_urdf(
     }
     try:
         spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
-        _add_motors(spec)
+        mimics = {
+            str(joint.get("name"))
+            for joint in root.iter("joint")
+            if joint.find("mimic") is not None
+        }
+        _add_motors(spec, mimics)
         return spec.compile(), velocities, changes
     except ValueError as error:
         if "inertia" in str(error) and not mend_inertias:
@@ -630,11 +632,11 @@ def _numbers(values: np.ndarray) -> str:
     return "(" + ", ".join(f"{v:.3g}" for v in values) + ")"
 
 
-def _add_motors(spec: "mujoco.MjSpec") -> None:
-    """Add a motor to each hinge and slide joint."""
+def _add_motors(spec: "mujoco.MjSpec", mimics: set[str]) -> None:
+    """Add a motor to each hinge and slide joint but those that mimic another."""
     single = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
     for joint in spec.joints:
-        if joint.type in single:
+        if joint.type in single and joint.name not in mimics:
             motor = spec.add_actuator(name=f"{joint.name} torque", target=joint.name)
             motor.trntype = mujoco.mjtTrn.mjTRN_JOINT
             motor.set_to_motor()

@@ -1,11 +1,11 @@
 """A robot of MuJoCo as a plant: one control period forward, and its affine models.
 
 A file gives two models. The plant is the model as written, except that the force limits of motors
-become `input_limits`. The predictor is the same without constraint rows (joint limits, contacts,
-friction loss, equalities): a stiff spring at a joint's end makes a linear model useless one sample
-later, so limits belong into the MPC. Both apply inputs without MuJoCo's clamp to `ctrlrange`, whose
-derivative is wrong at the bound, where MPC often operates: the controller has to keep u inside
-`input_limits`.
+become `input_limits`. The predictor is the same without limits of joints and of forces, contacts
+and friction loss: a stiff spring at a joint's end makes a linear model useless one sample later, so
+limits belong into the MPC. Couplings (equalities) are in both. Both apply inputs without MuJoCo's
+clamp to `ctrlrange`, whose derivative is wrong at the bound, where MPC often operates: the
+controller has to keep u inside `input_limits`.
 """
 
 import warnings
@@ -25,6 +25,7 @@ from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.jax_transformations import own_modes, varying
 from jaxmpc.qp.linalg import eigh, matmul
 from jaxmpc.robots.configurations import difference, quaternions, retract
+from jaxmpc.robots.couplings import Couplings
 from jaxmpc.robots.description import RobotDescription
 from jaxmpc.robots.equilibria import (
     inverse_actuation,
@@ -135,9 +136,10 @@ class Robot(RobotDescription):
 
         q: None for that of `home`; (..., nq) for many. The input (or the activation, where an
         actuator has one) balances gravity and passive forces, the least one where there are
-        several. near (nq,), in place of q: the configuration nearest to it that inputs within the
+        several. Couplings carry what they can; their springs yield a little, so x lies next to q
+        there. near (nq,), in place of q: the configuration nearest to it that inputs within the
         limits hold, inside the position limits: a local search, least squares of the forces and
-        of the motion. Limits' springs, contacts, equalities and dry friction do not help. Computed
+        of the motion. Limits' springs, contacts and dry friction do not help. Computed
         outside JAX in float64 by MuJoCo's C engine.
 
         Raises ValueError where the actuators cannot hold q at all, or only beyond input_limits,
@@ -157,6 +159,7 @@ class Robot(RobotDescription):
             require_rest("near", self, [rest])
             return rest.x, rest.u
         q = self.configurations("q", self.home[: self.mujoco.nq] if q is None else q)
+        self._require_coupled(q)
         rests = [rest_at(self, row) for row in q.reshape(-1, q.shape[-1])]
         cure = "Choose a configuration that the actuators hold, or search with near="
         for rest in rests:
@@ -172,6 +175,16 @@ class Robot(RobotDescription):
         require_rest("q", self, rests)
         x, u = (np.array([getattr(rest, name) for rest in rests]) for name in ("x", "u"))
         return x.reshape(*q.shape[:-1], self.state_size), u.reshape(*q.shape[:-1], self.m)
+
+    def _require_coupled(self, q: np.ndarray) -> None:
+        """Raise ValueError where configurations (..., nq) violate couplings of the file."""
+        couplings = Couplings(self.predictor.model)
+        for row in q.reshape(-1, q.shape[-1]) if couplings.there else ():
+            beyond = np.abs(couplings.rows(row)[0]).max()
+            if beyond > 1e-6:
+                nearest = couplings.met(row)[0]
+                problem = f"{row} violates couplings (equalities) of the file by {beyond:.3g}"
+                fail("q", problem, f"The nearest configuration that meets them: {nearest}")
 
     def set_point(self, target: Any = None) -> tuple[np.ndarray, np.ndarray]:
         """Return (x, u), the state and the input about which `robot_mpc` takes its model.

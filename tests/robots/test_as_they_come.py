@@ -283,11 +283,10 @@ ctrlrange="-1 1"/></actuator></mujoco>"""
 
 
 def test_report_names_what_the_predictor_ignores():
-    with pytest.warns(UserWarning, match="couplings that its linear models lack .1 of type joint"):
-        robot = load(CHAIN, velocity=3.0)
+    robot = load(CHAIN, velocity=3.0)
     report = robot.report()
     assert report.predictor_ignores == (
-        "1 pairs of shapes in contact", "1 equalities of type joint", "1 joints with dry friction",
+        "1 pairs of shapes in contact", "1 joints with dry friction",
         "1 stops of joints, whose ranges are limits of the MPC",
         "1 stops of tendons, no limits of the MPC",
         "1 limits of forces, which are rows of the MPC",
@@ -296,7 +295,7 @@ def test_report_names_what_the_predictor_ignores():
         "none", "file, range", "argument", "argument", "file, ctrlrange",
     ]  # fmt: skip
     text = str(report)
-    for part in ("robot robot", "home: file, qpos0", "2 hinge", "equalities of type joint"):
+    for part in ("robot robot", "home: file, qpos0", "2 hinge", "joints with dry friction"):
         assert part in text
     flags = '<option><flag equality="disable" limit="disable" contact="disable"/></option>'
     quiet = load(CHAIN.replace("<mujoco>", f"<mujoco>{flags}")).report()
