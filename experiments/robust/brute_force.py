@@ -14,11 +14,11 @@ import time
 from dataclasses import replace
 
 import numpy as np
-from jaxmpc.feasible.policy_hull import policy_hull
-from jaxmpc.feasible.policy_problem import problem_of
 from scipy.optimize import linprog
 
 import jaxmpc as jm
+from jaxmpc.feasible.policy_hull import policy_hull
+from jaxmpc.feasible.policy_problem import problem_of
 from jaxmpc.mpc.tightening import feedback_gain
 
 # States labelled infeasible that get a program, of each system.
