@@ -11,6 +11,7 @@ import problems
 import pytest
 
 import jaxmpc as jm
+from jaxmpc.closed_loop import Disturbance, KalmanFilter, OffsetFreeController, augmented
 from jaxmpc.export import check_fixed_steps, export_c
 
 CC = shutil.which("cc")
@@ -181,3 +182,29 @@ def test_closed_loop_check_names_bad_arguments(changes, message):
     given = dict(mpc=CHECKED, solver=jm.ADMM(), lower=[-1.0, -1.0], upper=[1.0, 1.0]) | changes
     with pytest.raises(ValueError, match=message):
         check_fixed_steps(**given)
+
+
+@compiled
+@pytest.mark.slow
+def test_an_offset_free_loop(tmp_path):
+    """The code of the augmented problem, the filter's two lines in NumPy, another plant: no error;
+    one limit is active on the way."""
+    A, B, C = np.array([[0.9, 0.1], [0.0, 0.8]]), np.array([[0.0], [0.5]]), np.array([[1.0, 0.0]])
+    mpc = jm.MPC(jm.LinearSystem(A, B), np.diag([5.0, 0.1]), [[0.1]], 10, inputs=jm.Box([-1], [1]))
+    load = Disturbance("input", 0.1)
+    filter_ = KalmanFilter(mpc.system, 0.1, 0.1, C=C, disturbance=load)
+    with jax.enable_x64(True):
+        free = OffsetFreeController(jm.Controller(mpc), filter_)
+        more = augmented(mpc, filter_)
+        code = Compiled(more, jm.ADMM(iterations=200, newton_steps=0), tmp_path)
+        L, A_d, B_d = np.asarray(free.observer.gain), more.system.A, more.system.B
+        x, z, inputs = np.zeros(2), np.zeros(3), []
+        for _ in range(120):
+            z = z + L @ (C @ x - z[:1])
+            target = free.target(np.array([1.0, 0.0]), z[2:])
+            u, status = code.step(z, np.append(target.x, 0.0), target.u)
+            inputs.append(u)
+            assert status == 1
+            x = np.array([[0.85, 0.12], [0.02, 0.83]]) @ x + np.array([0.01, 0.4]) * u + 0.02
+            z = A_d @ z + B_d @ u
+    assert np.max(inputs) == 1 and abs(x[0] - 1) < 1e-6
