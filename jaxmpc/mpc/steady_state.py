@@ -27,9 +27,10 @@ from jaxmpc.systems.system import LinearSystem, host_matrices
 
 # Singular values of balanced matrices, relative to the largest, that count as zero.
 FLAT = 1e-10
-# Cost of effort beside that of the outputs, where outputs leave inputs free. Twice as far from the
-# last answer as from the first one (`SteadyStates.nearest`), so outputs are off by its square.
+# Weight of effort beside distances of outputs, where these leave inputs free. Outputs are off by
+# its square (`SteadyStates.nearest`).
 EFFORT = 1e-6
+# Errors of targets are errors of the loop, which settles there.
 TIGHT = ADMM(eps=1e-10)
 
 
@@ -128,7 +129,9 @@ class SteadyStates:
     count: int = static()
 
     @classmethod
-    def of(cls, mpc: MPC, system: LinearSystem, outputs: np.ndarray, unit: np.ndarray) -> Any:
+    def of(
+        cls, mpc: MPC, system: LinearSystem, outputs: np.ndarray, unit: np.ndarray
+    ) -> "SteadyStates":
         """Return the steady states of a problem for outputs (q, n), whose errors are measured in
         these units (q,). system: its model, with values that can be read; limits may be traced.
         Raises ValueError where the inputs do not hold every load."""
@@ -151,8 +154,7 @@ class SteadyStates:
         seen = np.zeros((m, len(unit)))
         seen[:count] = U.T[:count]
         dtype = floating_dtype(mpc)
-        held_rows = [replace(b, steps=b.steps[:1]) for b in blocks(mpc, dtype) if not b.rate]
-        rows = [_hard_at_rest(b) for b in held_rows if b.steps]
+        rows = [_at_rest(b) for b in blocks(mpc, dtype) if b.steps and not b.rate]
         bounds = joined_bounds([b.bounds() for b in rows], dtype)
         parts = [jnp.zeros((0, n + m), dtype)]
         for b in rows:
@@ -172,12 +174,13 @@ class SteadyStates:
         return _nearest(self, target, load)
 
 
-def _hard_at_rest(block: Block) -> Block:
+def _at_rest(block: Block) -> Block:
     """Return the rows of a block, hard, at one step, with the bounds that hold at all of them."""
-    if np.ndim(block.lower) == 2:
-        lower, upper = jnp.max(block.lower, axis=0), jnp.min(block.upper, axis=0)
-        block = replace(block, lower=lower, upper=upper)
-    return replace(block, linear=None, quadratic=None)
+    lower, upper = block.lower, block.upper
+    if np.ndim(lower) == 2:
+        lower, upper = jnp.max(lower, axis=0), jnp.min(upper, axis=0)
+    hard = replace(block, lower=lower, upper=upper, linear=None, quadratic=None)
+    return replace(hard, steps=block.steps[:1])
 
 
 @compiled_lightly(0, static_argnames=("count", "balls"))

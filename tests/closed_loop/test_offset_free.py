@@ -235,6 +235,27 @@ def test_time_varying_gain_is_the_textbook_recursion(controller):
 
 
 @pytest.mark.slow
+def test_a_robots_own_model_estimates_a_torque():
+    """The extended filter of a pendulum that carries a constant torque, from its angle alone."""
+    robot, torque = jm.load_robot("pendulum"), 0.3
+
+    class Loaded:
+        coordinates, state = staticmethod(robot.coordinates), staticmethod(robot.state)
+        state_size, m = robot.state_size, robot.m
+
+        def step(self, x, u):
+            return robot.step(x, u + torque)
+
+    mpc = jm.MPC(jm.LinearSystem(np.eye(2), [[0.0], [1.0]]), np.eye(2), [[1.0]], 2)
+    law = LinearFeedback(mpc, [[-40.0, -10.0]], robot)
+    load = Disturbance("input", 0.05, initial=0.5)
+    filter_ = KalmanFilter(robot, 1e-4, 1e-3, initial=0.01, disturbance=load)
+    run = jm.simulate(law, Loaded(), robot.equilibrium()[0], 60, observer=filter_)
+    np.testing.assert_allclose(run.disturbances[-1], [torque], atol=1e-3)
+    np.testing.assert_allclose(run.estimates[-1], run.states[-2], atol=1e-3)
+
+
+@pytest.mark.slow
 def test_derivatives_through_estimator_and_targets():
     """Of a cost of the loop in start, reference, load, weight and the filter's noise: differences;
     an input is at its limit for some steps, and so is the target's."""
