@@ -9,6 +9,11 @@ eliminated each row is F θ + G v + (D + G M) ω, and it holds for all disturban
 convex in (θ, v, M) together. With T ≥ |D + G M|, entry by entry, these are linear rows over
 (θ, v, M, T): a `PlanPolytope`, whose projection on θ is the feasible set of the class.
 
+*Tubes* (Mayne, Seron & Raković 2005, Automatica 41): u_k = v_k + K (x_k − z_k) with a nominal
+trajectory z that begins anywhere in x_0 − S, S = center + {G ζ : |ζ_i| ≤ 1} a robust invariant set
+under K. The rows of z are tightened by S, at all steps alike, and z_0 = θ − center − G ζ: linear
+rows over (θ, v, ζ), which are one more case of the above, with ζ beside v and no M.
+
 *Proofs* are evaluated on the rows in rational arithmetic (`ExactRows`), whatever found the numbers.
 Feasible: the triple (θ, v, M). Infeasible: for multipliers y⁺, y⁻ ≥ 0 of the two sides of the rows
 and any Q with |Q| ≤ y⁺ + y⁻, row by row, every feasible triple keeps
@@ -33,11 +38,12 @@ from jaxmpc.feasible.hard_constraints import Axes, hard_blocks, make_view
 from jaxmpc.feasible.plan_polytope import PlanPolytope
 from jaxmpc.feasible.problem import FeasibilityProblem, as_box
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.mpc.tightening import without_disturbance
+from jaxmpc.mpc.tightening import feedback_gain, without_disturbance
 from jaxmpc.pytrees import record
 from jaxmpc.sets.convex_sets import Box, Zonotope
 from jaxmpc.sets.disturbances import disturbance_columns
 from jaxmpc.sets.lp import Program, power_of_two
+from jaxmpc.sets.minimal_invariant import minimal_robust_invariant_set
 from jaxmpc.systems.system import host_matrices
 
 # Bits of the numbers whose sums are computed exactly, relative to the largest of an array.
@@ -55,15 +61,18 @@ def problem_of(mpc: MPC, axes: Axes = None, fixed: Reals | None = None) -> Feasi
 
 class PolicyRows(NamedTuple):
     """lower ≤ F θ + G v + (D + G M) ω ≤ upper in exact fractions (arrays of objects): F (R, d), G
-    (R, N m), D (R, N g), lower and upper (R,), None where there is no bound; step (R,): the k of
-    each."""
+    (R, N m), D (R, N g), lower and upper (R,), None where there is no bound. low, high (N m,):
+    bounds of each v. first: (m, N m) and (m,), the first input from v. Of a tube v is (v, ζ), and
+    there is no ω."""
 
     F: np.ndarray
     G: np.ndarray
     D: np.ndarray
     lower: list[Fraction | None]
     upper: list[Fraction | None]
-    step: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    first: tuple[np.ndarray, np.ndarray]
 
 
 @record
@@ -84,32 +93,37 @@ class PolicyProblem(FeasibilityProblem):
         hard = replace(mpc, soft=(), input_rate_weight=None, **boxes)
         cure = 'Leave it out, or give policy="tightened"'
         if hard.control_horizon is not None:
-            fail("control_horizon", "given with affine policies", cure)
+            fail("control_horizon", f"given with policy {hard.policy!r}", cure)
         if hard.rate_limited:
-            fail("input_rate_limit", "given with affine policies", cure)
+            fail("input_rate_limit", f"given with policy {hard.policy!r}", cure)
         inputs = hard.inputs
         if not isinstance(inputs, Box) or not np.isfinite([inputs.lower, inputs.upper]).all():
             fail("inputs", "are in no bounded Box, which proofs of this policy need", "Give one")
         view = make_view(hard, axes, fixed)
         if view.projects:
-            fail("axes", "give a projection, which affine policies do not know", "Give fixed too")
-        directions(hard)
+            fail("axes", "give a projection, which this policy does not know", "Give fixed too")
+        if hard.policy == "affine":
+            directions(hard)
         return cls(hard, view)
 
     @cached_property
     def fractions(self) -> PolicyRows:
         """Return the rows without any rounding."""
-        return condensed_fractions(self.mpc, self.view)
+        tube = self.mpc.policy == "tube"
+        return (tube_fractions if tube else affine_fractions)(self.mpc, self.view)
 
     @cached_property
     def exact_rows(self) -> "ExactRows":
         """Return them as integers."""
-        return ExactRows(self.mpc, self.fractions)
+        return ExactRows(self.fractions)
 
     @cached_property
     def causal(self) -> np.ndarray:
         """Return which entries (N m, N g) of M answer to earlier disturbances."""
-        N, m, g = self.mpc.horizon, self.mpc.system.m, directions(self.mpc)[1].shape[1]
+        N, m = self.mpc.horizon, self.mpc.system.m
+        if self.mpc.policy == "tube":
+            return np.zeros((self.fractions.G.shape[1], 0), bool)
+        g = directions(self.mpc)[1].shape[1]
         return np.kron(np.tril(np.ones((N, N)), -1), np.ones((m, g))) > 0
 
     @cached_property
@@ -123,8 +137,10 @@ class PolicyProblem(FeasibilityProblem):
         whole = replace(self, view=make_view(self.mpc)) if self.view.others else self
         lifted, n = whole.lifted, self.mpc.system.n
         A, B, c = host_matrices(self.mpc.system)
+        gain, shift = whole.fractions.first
         M = np.zeros((n, lifted.rows.shape[1]))
-        M[:, :n], M[:, n : n + B.shape[1]] = A, B
+        M[:, :n], M[:, n : n + gain.shape[1]] = A, B @ gain
+        c = c + B @ shift
         size = np.linalg.norm(lifted.rows, axis=1)
         return PlanPolytope(lifted.rows / size[:, None], lifted.bounds / size, M, c, True)
 
@@ -176,27 +192,79 @@ def exactly(values: Any) -> np.ndarray:
     return np.asarray(np.frompyfunc(Fraction, 1, 1)(np.asarray(values, np.float64)), object)
 
 
-def condensed_fractions(mpc: MPC, view: Any) -> PolicyRows:
-    """Return the rows of a problem over θ, v and ω, all products of the data exact."""
-    N, n, m = mpc.horizon, mpc.system.n, mpc.system.m
+def affine_fractions(mpc: MPC, view: Any) -> PolicyRows:
+    """Return the rows under affine policies, over θ, v and ω, all products of the data exact."""
+    n = mpc.system.n
     center, gamma = directions(mpc)
-    A, B, c = map(exactly, host_matrices(mpc.system))
     E = exactly(disturbance_columns(mpc.disturbance_matrix, n))
-    c, push, g = c + E @ center, E @ gamma, gamma.shape[1]
-    zero = lambda *shape: np.full(shape, Fraction(0), object)
-    S, base = zero(n, len(view.axes)), zero(n)
+    return condensed_fractions(mpc, view, E @ center, E @ gamma)
+
+
+def tube_fractions(mpc: MPC, view: Any) -> PolicyRows:
+    """Return the rows of a tube, over θ and (v, ζ), all products of the data exact."""
+    n, m, N = mpc.system.n, mpc.system.m, mpc.horizon
+    gain = np.asarray(feedback_gain(mpc), float)
+    plant, W = replace(mpc.system, c=None), mpc.disturbance
+    found = minimal_robust_invariant_set(plant, gain, W, disturbance_matrix=mpc.disturbance_matrix)
+    section = found.to_zonotope()
+    center, generators = exactly(section.center), exactly(section.generators)
+    count = generators.shape[1]
+    nominal = condensed_fractions(mpc, view, 0 * center, zeros(n, 0))
+    # z_0 = θ − center − G ζ: what an initial state adds to each row, without the view.
+    whole = condensed_fractions(mpc, make_view(mpc), 0 * center, zeros(n, 0)).F
+    G = np.hstack([nominal.G, -(whole @ generators)])
+    shift, K = whole @ center, exactly(gain)
+    lower: list[Fraction | None] = []
+    upper: list[Fraction | None] = []
+    rows = [
+        row
+        for b in hard_blocks(without_disturbance(mpc))
+        for k in b.steps
+        for row in exactly(b.H) + (exactly(b.D) @ K if k < N else 0)
+    ]
+    for row, low, high, moved in zip(rows, nominal.lower, nominal.upper, shift, strict=True):
+        middle, half = row @ center, sum(abs(row @ generators))
+        lower.append(None if low is None else low + moved - middle + half)
+        upper.append(None if high is None else high + moved - middle - half)
+    one = [Fraction(1)] * count
+    limits = np.hstack([zeros(count, N * m), np.diag(np.array(one, object))]) if count else G[:0]
+    first = np.hstack([nominal.first[0], gain @ np.asarray(section.generators, float)])
+    return PolicyRows(
+        F=np.vstack([nominal.F, zeros(count, nominal.F.shape[1])]),
+        G=np.vstack([G, limits + zeros(count, G.shape[1])]),
+        D=zeros(len(G) + count, 0),
+        lower=[*lower, *(-v for v in one)],
+        upper=[*upper, *one],
+        low=np.append(nominal.low, [-v for v in one]),
+        high=np.append(nominal.high, one),
+        first=(first, gain @ np.asarray(section.center, float)),
+    )
+
+
+def zeros(*shape: int) -> np.ndarray:
+    """Return an array of zero Fractions."""
+    return np.full(shape, Fraction(0), object)
+
+
+def condensed_fractions(mpc: MPC, view: Any, drift: np.ndarray, push: np.ndarray) -> PolicyRows:
+    """Return the rows of x⁺ = A x + B u + c + drift + push ω without any rounding, their bounds as
+    given."""
+    N, n, m, g = mpc.horizon, mpc.system.n, mpc.system.m, push.shape[1]
+    A, B, c = map(exactly, host_matrices(mpc.system))
+    c = c + drift
+    S, base = zeros(n, len(view.axes)), zeros(n)
     for i, axis in enumerate(view.axes):
         S[axis, i] = Fraction(1)
     for axis in view.others:
         base[axis] = Fraction(float(view.fixed[axis]))
-    states = [(S, zero(n, N * m), zero(n, N * g), base)]
+    states = [(S, zeros(n, N * m), zeros(n, N * g), base)]
     for k in range(N):
         F, G, D, f = states[-1]
         G, D = A @ G, A @ D
         G[:, k * m : (k + 1) * m] += B
         D[:, k * g : (k + 1) * g] += push
         states.append((A @ F, G, D, A @ f + c))
-    F_rows, G_rows, D_rows, step = [], [], [], []
+    F_rows, G_rows, D_rows = [], [], []
     lower: list[Fraction | None] = []
     upper: list[Fraction | None] = []
     for b in hard_blocks(without_disturbance(mpc)):
@@ -213,9 +281,12 @@ def condensed_fractions(mpc: MPC, view: Any) -> PolicyRows:
                 D_rows.append(D[i])
                 lower.append(Fraction(low) - f[i] if np.isfinite(low) else None)
                 upper.append(Fraction(high) - f[i] if np.isfinite(high) else None)
-                step.append(k)
-    parts = [np.array(v, object).reshape(len(step), -1) for v in (F_rows, G_rows, D_rows)]
-    return PolicyRows(parts[0], parts[1], parts[2], lower, upper, np.array(step))
+    F, G, D = (np.array(v, object).reshape(len(lower), -1) for v in (F_rows, G_rows, D_rows))
+    box: Any = mpc.inputs
+    ends = [np.tile(exactly(end), N) for end in (box.lower, box.upper)]
+    first = np.eye(m, N * m), np.zeros(m)
+    D = D.reshape(len(lower), N * g)
+    return PolicyRows(F, G, D, lower, upper, ends[0], ends[1], first)
 
 
 class Lifted(NamedTuple):
@@ -367,7 +438,7 @@ class HalfSpace(NamedTuple):
 class ExactRows:
     """The rows as integers over 2^e, for proofs without rounding."""
 
-    def __init__(self, mpc: MPC, p: PolicyRows) -> None:
+    def __init__(self, p: PolicyRows) -> None:
         bounds = [v for v in (*p.lower, *p.upper) if v is not None]
         every = [*p.F.ravel(), *p.G.ravel(), *p.D.ravel(), *bounds]
         self.e = max((v.denominator.bit_length() - 1 for v in every), default=0)
@@ -375,9 +446,7 @@ class ExactRows:
         self.F, self.G, self.D = whole(p.F), whole(p.G), whole(p.D)
         self.lower = [None if v is None else int(v * 2**self.e) for v in p.lower]
         self.upper = [None if v is None else int(v * 2**self.e) for v in p.upper]
-        box: Any = mpc.inputs
-        ends = np.asarray(box.lower, float), np.asarray(box.upper, float)
-        self.v_lower, self.v_upper = (np.tile(exactly(end), mpc.horizon) for end in ends)
+        self.v_lower, self.v_upper = p.low, p.high
 
     def proves(self, theta: np.ndarray, v: np.ndarray, M: np.ndarray) -> bool:
         """Return whether a triple of floats keeps all rows."""

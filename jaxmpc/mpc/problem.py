@@ -36,7 +36,7 @@ from jaxmpc.systems.system import LinearSystem, host_matrices
 # Curvature of the cost, relative to its terms, below which a direction of the inputs costs nothing.
 FLAT = 1e-12
 # How inputs answer to disturbances: see `MPC`.
-POLICIES = ("tightened", "affine")
+POLICIES = ("tightened", "tube", "affine")
 
 
 class TwoSided:
@@ -173,9 +173,10 @@ class MPC:
     disturbances. "tightened": u_k = v_k + K (x_k − z_k) with z the nominal states of the plan v and
     K = gain (m, n), u = Kx; None: the LQR gain of Q and R. Plans, costs and multipliers are those
     of z and v, whose rows are tightened by what the disturbance can do (`tightening.py`).
-    "affine": u_k = v_k + Σ_{j<k} M_kj w_j, of which the former are a part; it has the largest
-    feasible set and is for maps, boundaries and polytopes of it. Labels of feasible sets are claims
-    about the policy.
+    "affine": u_k = v_k + Σ_{j<k} M_kj w_j, of which these are a part; it has the largest feasible
+    set. "tube": u_k = v_k + K (x_k − z_k) with z_0 anywhere in x_0 − S, S the minimal robust
+    invariant set under K. These two are for maps, boundaries and polytopes of feasible sets. Labels
+    of feasible sets are claims about the policy.
     """
 
     system: LinearSystem

@@ -234,6 +234,8 @@ def _by_theorem(mpc: MPC) -> Claim:
     steps, and inputs free at each step. Without a terminal set, X takes its place at horizon N − 1.
     Convexity and compactness, which the theorem asks for, are used nowhere in this argument.
     """
+    if mpc.disturbance is not None and mpc.policy == "tube":
+        return Claim(None, "Theorem 1 is not checked for tubes")
     if not is_standard_form(mpc) or (mpc.terminal_set is None and mpc.horizon == 1):
         return Claim(None, "Theorem 1 does not cover these limits")
     last = mpc.states if mpc.terminal_set is None else mpc.terminal_set

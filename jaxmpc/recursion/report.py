@@ -126,7 +126,9 @@ def save_report(
         facets = {"facet_normals": np.asarray(body.H), "facet_offsets": np.asarray(body.h)}
     remove_files(folder, *FILES)
     arrays = folder / "recursion.npz"
-    problem = {"problem": FeasibilityProblem.of(report.mpc).plain()}
+    # Labels under policies of more than one sequence of inputs are not stored.
+    plain = report.mpc.disturbance is None or report.mpc.policy == "tightened"
+    problem = {"problem": FeasibilityProblem.of(report.mpc).plain() if plain else None}
     found = {name: getattr(loops, name) for name in ("lost_at", "undecided_at")}
     found |= {"state": loops.x0s, "input": loops.inputs, "next_state": loops.next_states}
     write_arrays(arrays, problem, **facets, **loops.labels.arrays(), **found)

@@ -11,6 +11,7 @@ import jaxmpc as jm
 from jaxmpc.feasible import boundary, feasible_polytope
 from jaxmpc.feasible.policy_hull import policy_hull
 from jaxmpc.feasible.policy_problem import problem_of
+from jaxmpc.sets import minimal_robust_invariant_set
 
 A, B = np.array([[1.0, 1.0], [0.0, 1.0]]), np.array([[0.5], [1.0]])
 SYSTEM = jm.LinearSystem(A, B)
@@ -189,8 +190,8 @@ def test_slices_and_recursion():
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"control_horizon": 2}, "control_horizon: given with affine policies"),
-        ({"input_rate_limit": 1.0}, "input_rate_limit: given with affine policies"),
+        ({"control_horizon": 2}, "control_horizon: given with policy 'affine'"),
+        ({"input_rate_limit": 1.0}, "input_rate_limit: given with policy 'affine'"),
         ({"inputs": None}, "inputs: are in no bounded Box"),
         ({"gain": K}, "gain: given with affine policies"),
         ({"disturbance": W.to_polytope()}, "affine policies answer to generators"),
@@ -219,3 +220,56 @@ def test_what_takes_one_sequence_refuses_affine_policies():
             call()
     with pytest.raises(ValueError, match="give a projection"):
         jm.map_feasible_set(mpc, np.zeros((1, 1)), axes=[0])
+
+
+def worst_of_tube(mpc: jm.MPC, x0: np.ndarray, plan: np.ndarray) -> float:
+    """Return by how much u = v + K (x − z), z_0 = x_0 − center − G ζ, breaks a limit, over all
+    vertex sequences."""
+    N, m = mpc.horizon, mpc.system.m
+    S = minimal_robust_invariant_set(SYSTEM, K, mpc.disturbance).to_zonotope()
+    v, zeta = plan[: N * m].reshape(N, m), plan[N * m :]
+    assert np.abs(zeta).max() <= 1
+    z = x0 - np.asarray(S.center) - np.asarray(S.generators) @ zeta
+    w = np.array(list(itertools.product(mpc.disturbance.vertices(), repeat=N)))
+    x, worst = np.tile(x0, (len(w), 1)), -np.inf
+    for k in range(N + 1):
+        H, h = (X if k < N else mpc.terminal_set).half_spaces()
+        worst = max(worst, np.max(x @ H.T - h))
+        if k < N:
+            u = v[k] + (x - z) @ K.T
+            worst = max(worst, np.abs(u).max() - 1.0)
+            x, z = x @ A.T + u @ B.T + w[:, k], A @ z + B @ v[k]
+    return worst
+
+
+def test_tubes():
+    """The set is Z ⊕ S with the nominal set Z of tightened limits, built by other functions; its
+    policies keep all limits under every sequence."""
+    small = jm.Box([-0.1, -0.1], [0.1, 0.1])
+    last = jm.maximal_invariant_set(SYSTEM, K, X, U, disturbance=small)
+    mpc = double(policy="tube", gain=K, disturbance=small, terminal_set=last, horizon=4)
+    S = minimal_robust_invariant_set(SYSTEM, K, small).to_zonotope()
+    less = lambda body, M: body.to_polytope().pontryagin_difference(S.image(M).vertices())
+    Z = feasible_polytope(
+        jm.MPC(
+            SYSTEM,
+            np.eye(2),
+            0.1,
+            4,
+            less(X, np.eye(2)),
+            less(U, K),
+            terminal_set=jm.Polytope(last.H, last.h).pontryagin_difference(S.vertices()),
+        )  # fmt: skip
+    )
+    expected = Z.minkowski_sum(S.vertices())
+    found = feasible_polytope(mpc)
+    assert found.is_subset(expected, 1e-7) and expected.is_subset(found, 1e-7)
+    problem = problem_of(mpc)
+    points = np.random.default_rng(0).uniform([-5, -2], [5, 2], (300, 2))
+    labels = jm.map_feasible_set(problem, points)
+    np.testing.assert_array_equal(labels.label == 1, [bool(expected.contains(x)) for x in points])
+    inside = points[labels.label == 1][:30]
+    plans, _ = policy_hull(problem).policies(inside)
+    each = zip(inside, plans, strict=True)
+    assert max(worst_of_tube(mpc, *one) for one in each) <= 1e-9
+    assert jm.recursive_feasibility(mpc).strong.holds
