@@ -182,6 +182,11 @@ def require_symmetric_psd(argument: str, value: Any, *, definite: bool = False) 
     matrix = np.asarray(value, dtype=np.float64)
     scale = max(np.abs(matrix).max(initial=0.0), np.finfo(np.float64).tiny)
     if np.abs(matrix - matrix.T).max(initial=0.0) > 1e-6 * scale:
+        for half, rest, k in (("triu", np.tril(matrix, -1), 1), ("tril", np.triu(matrix, 1), -1)):
+            if not rest.any():
+                whole = f"{argument} + np.{half}({argument}, {k}).T"
+                cure = f"For one half of a symmetric matrix use {whole}"
+                fail(argument, "is triangular, not symmetric", cure)
         fail(argument, "is not symmetric", f"Use ({argument} + {argument}.T) / 2")
     least = np.linalg.eigvalsh((matrix + matrix.T) / 2)[0]
     if definite and least <= 0:

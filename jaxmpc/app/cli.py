@@ -45,6 +45,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run a command and return its exit code: 0 done, 2 error, 130 interrupted, 141 nobody reads
     its output any more."""
     argv = list(sys.argv[1:] if argv is None else argv)
+    for stream in (sys.stdout, sys.stderr):  # what their encoding lacks becomes "?"
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
     if argv == ["--version"]:
         print(f"jaxmpc {jaxmpc.__version__}")
         return 0

@@ -32,7 +32,7 @@ from jaxmpc.explicit.parametric_qp import (
     in_numpy,
 )
 from jaxmpc.mpc.condense import Inequalities, condensed_in_float64
-from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.problem import MPC, RELAX
 from jaxmpc.pytrees import record
 from jaxmpc.sets.convex_sets import Box, Polytope, unit_half_spaces
 from jaxmpc.sets.geometry import (
@@ -423,7 +423,7 @@ def least_distance_form(
     given = GivenProgram.of(problem, within)
     mpc = isinstance(problem, MPC)
     name = "mpc" if mpc else "problem"
-    relax = "Relax a limit or " + ("lengthen the horizon" if mpc else "enlarge within")
+    relax = RELAX if mpc else "Relax a limit or enlarge within"
     if given.program.empty:
         fail(name, "its feasible set is empty", relax)
     flat = "its feasible set is flat: no initial state keeps a margin"

@@ -15,7 +15,7 @@ from jax import Array
 
 from jaxmpc.checks import fail
 from jaxmpc.feasible.hard_constraints import View, absorbed
-from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.problem import MPC, RELAX
 from jaxmpc.mpc.rows import Block
 from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.linalg import matmul
@@ -374,8 +374,7 @@ class RowPrograms:
             fail("center", f"{given} is not inside the feasible set", "Give None or another")
         empty, flat = "is empty: no initial state has a plan", "is flat: no initial state keeps"
         what = empty if t < -FLAT else f"{flat} a margin"
-        cure = "Relax a limit, lengthen the horizon or enlarge the terminal set"
-        fail("mpc", f"its feasible set {what}", cure)
+        fail("mpc", f"its feasible set {what}", RELAX)
 
 
 def _rank(M: np.ndarray) -> int:

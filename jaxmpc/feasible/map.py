@@ -377,7 +377,10 @@ def _map_policies(
 def _require_points(problem: FeasibilityProblem, points: np.ndarray) -> None:
     d = problem.dimension
     if points.ndim != 2 or points.shape[1] != d:
-        fail("x0s", f"shape {points.shape}", f"Give points (B, {d}), one column a mapped state")
+        columns = f"points (B, {d}), one column a mapped state"
+        if problem.mpc.rate_limited and points.shape[1:] == (problem.mpc.system.n,):
+            columns = f"points (B, {d}): states, then previous inputs, for rates are limited"
+        fail("x0s", f"shape {points.shape}", f"Give {columns}")
 
 
 def label_chunks(

@@ -35,6 +35,8 @@ from jaxmpc.systems.system import LinearSystem, host_matrices
 
 # Curvature of the cost, relative to its terms, below which a direction of the inputs costs nothing.
 FLAT = 1e-12
+# What helps where no state has a plan; without a terminal set no longer horizon: X_{N+1} ⊆ X_N.
+RELAX = "Relax a limit; with a terminal set enlarge that or lengthen the horizon"
 # How inputs answer to disturbances: see `MPC`.
 POLICIES = ("tightened", "tube", "affine")
 
@@ -217,7 +219,7 @@ class MPC:
         if not {dimensions(system.A), dimensions(system.B)} <= {2, 3}:
             return
         n, m = system.n, system.m
-        for name, size in (("Q", n), ("R", m), ("terminal_cost", n)):
+        for name, size in (("Q", n), ("R", m), ("terminal_cost", n), ("input_rate_weight", m)):
             object.__setattr__(self, name, as_weight(getattr(self, name), size))
         sets = {"states": n, "inputs": m, "terminal_set": n, "disturbance": self.disturbances}
         for name, size in sets.items():

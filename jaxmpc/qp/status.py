@@ -78,7 +78,7 @@ _SENTENCES = {
     ),
     Status.PRIMAL_INFEASIBLE: (
         "No point satisfies the constraints; a Farkas vector proves it. "
-        "Relax a limit, lengthen the horizon or soften rows."
+        "Relax a limit or soften rows; with a terminal set enlarge that or lengthen the horizon."
     ),
     Status.DUAL_INFEASIBLE: (
         "The cost falls without bound, to working precision, along a feasible ray. "

@@ -51,6 +51,9 @@ from jaxmpc.recursion.proofs import (
 from jaxmpc.recursion.report import RecursionReport, SmallestHorizon
 from jaxmpc.recursion.time_budget import LABELS, PLANS, PROOFS, Budget
 
+# Where to look for lost states beside a worst vertex: so far towards the centre.
+NEAR_THE_WORST = np.array([1e-6, 1e-4, 1e-3, 1e-2])
+
 
 def recursive_feasibility(
     mpc: MPC,
@@ -153,6 +156,10 @@ def examine(
         if bound is None:
             fail("x0s", f"None, and {claims.why}", "Give the states to look at, (B, n)")
         samples = _samples(claims, starts, bound.center)
+        if len(verdict.worst):
+            # A lost part may lie between the points of a grid: look at it, too.
+            inwards = NEAR_THE_WORST[:, None, None] * (bound.center - verdict.worst)
+            samples = np.concatenate([samples, (verdict.worst + inwards).reshape(-1, p)])
     easy = samples[0] if bound is None else bound.center
     chunk = 1024 if len(samples) <= 16_384 else default_chunk()
     regions, worst = verdict.regions, None

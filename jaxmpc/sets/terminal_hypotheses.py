@@ -159,9 +159,8 @@ def verify_terminal(
     U = _Rows(*unit_half_spaces("inputs", inputs, system.m))
     gain, P, no_law = _gain_and_cost(system, Q, R, K, terminal_cost)
     W = disturbance_set(disturbance, system.n, disturbance_matrix)
-    X_f = X if terminal_set is None else _terminal_set(terminal_set, system.n)
-    role = " (there is no terminal set: X in its role, at horizon N - 1)"
-    role = role if terminal_set is None else ""
+    # Without one X takes its role, at horizon N − 1.
+    X_f = replace(X, called="X") if terminal_set is None else _terminal_set(terminal_set, system.n)
     name = "inputs of K admissible"
     if gain is None:
         loop = None
@@ -172,13 +171,13 @@ def verify_terminal(
         under_K = X_f.invariance(loop)
         admissible = _within(name, system.input_labels, U, gain, X_f)
     name = "terminal set within states"
-    inside = _within(name, system.state_labels, X, np.eye(system.n), X_f, role)
+    inside = _within(name, system.state_labels, X, np.eye(system.n), X_f)
     step = one_step(system, inputs, disturbance, disturbance_matrix)
     checks = [
         _compact("states", "X", X),
         _compact("inputs", "U", U),
         replace(inside, theorems=(1, 3)),
-        _control_invariance(step, X_f, under_K.check, admissible, role),
+        _control_invariance(step, X_f, under_K.check, admissible),
         under_K.check,
         admissible,
         _lyapunov(loop, P, Q, R, no_law),
@@ -246,10 +245,11 @@ class _Invariance(NamedTuple):
 
 @record
 class _Rows:
-    """{G x <= g}, rows of norm 1; no rows for all of R^n."""
+    """{G x <= g}, rows of norm 1; no rows for all of R^n. called: in sentences."""
 
     G: np.ndarray
     g: np.ndarray
+    called: str = "the terminal set"
 
     def maxima(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return (upper bounds of max row x, M with M G = rows but for rounding); inf if
@@ -323,20 +323,22 @@ class _Rows:
                 point = not hull.basis.size
                 what = "the origin alone" if point else "flat, with the origin in its middle"
                 sentence = (
-                    f"The terminal set is {what}, and the optimal cost is continuous on the "
-                    "polytope X_N all the same."
+                    f"{self.called.capitalize()} is {what}, and the optimal cost is continuous on "
+                    "the polytope X_N all the same."
                 )
-                return replace(_origin_at(0.0 if point else depth), holds=True, sentence=sentence)
-            return _origin_at(depth)
-        return _origin_at(float(self.g.min(initial=np.inf)))
+                there = _origin_at(0.0 if point else depth, self.called)
+                return replace(there, holds=True, sentence=sentence)
+            return _origin_at(depth, self.called)
+        return _origin_at(float(self.g.min(initial=np.inf)), self.called)
 
 
 @record
 class _Ellipse:
-    """{x'P x <= level}."""
+    """{x'P x <= level}. called: in sentences."""
 
     P: np.ndarray
     level: float
+    called: str = "the terminal set"
 
     def maxima(self, rows: np.ndarray) -> tuple[np.ndarray, None]:
         """Return (max row x, None)."""
@@ -378,13 +380,13 @@ class _Ellipse:
 
     def origin_inside(self) -> Check:
         """Check that the origin, which is its center, lies in the interior."""
-        return _origin_at(float(np.sqrt(self.level / np.linalg.eigvalsh(self.P)[-1])))
+        return _origin_at(float(np.sqrt(self.level / np.linalg.eigvalsh(self.P)[-1])), self.called)
 
 
-def _origin_at(depth: float) -> Check:
-    """Return the check of the origin at this depth in the terminal set."""
+def _origin_at(depth: float, called: str) -> Check:
+    """Return the check of the origin at this depth in a set."""
     where = "within" if depth > 0 else "on the boundary of" if depth == 0 else "outside"
-    sentence = f"The origin lies {where} the terminal set, {abs(depth):.6g} from its boundary."
+    sentence = f"The origin lies {where} {called}, {abs(depth):.6g} from its boundary."
     return Check("origin inside terminal set", depth > 0, depth, "distance in x", sentence)
 
 
@@ -421,7 +423,6 @@ def _within(
     limits: _Rows,
     output: np.ndarray,
     X_f: _Rows | _Ellipse,
-    role: str = "",
 ) -> Check:
     """Check that `output` x lies within the limits for all x in X_f; the margin is a distance from
     a row's hyperplane."""
@@ -438,12 +439,12 @@ def _within(
         sentence = f"The set is unbounded, and so is the violation of {limit}."
         return Check(name, False, -np.inf, unit, sentence)
     holds = bool((slack >= -_TOUCH * np.maximum(np.abs(g), X_f.width(rows, tops))).all())
-    reached = f"The tightest limit, {limit}, is reached up to {tops[worst]:.6g} on the terminal set"
-    return Check(name, holds, float(slack[worst]), unit, f"{reached}{role}.")
+    reached = f"The tightest limit, {limit}, is reached up to {tops[worst]:.6g} on {X_f.called}"
+    return Check(name, holds, float(slack[worst]), unit, f"{reached}.")
 
 
 def _control_invariance(
-    step: OneStep, X_f: _Rows | _Ellipse, kept: Check, admissible: Check, role: str
+    step: OneStep, X_f: _Rows | _Ellipse, kept: Check, admissible: Check
 ) -> Check:
     """Check control invariance of X_f: by the law K, or by one step backwards."""
 
@@ -451,30 +452,30 @@ def _control_invariance(
         return Check("control invariance", holds, margin, "of the extent", sentence, (1,))
 
     if kept.holds and admissible.holds:
-        sentence = f"u = K x is admissible and keeps the state in the terminal set{role}."
+        sentence = f"u = K x is admissible and keeps the state in {X_f.called}."
         return replace(check(True, kept.margin, sentence), unit=kept.unit)
     if isinstance(X_f, _Ellipse):
         sentence = "K does not show it, and whether another law does is not decided for ellipsoids."
         return check(None, None, sentence)
     if not len(X_f.g):
-        return check(True, np.inf, f"All of R^n is invariant{role}.")
+        return check(True, np.inf, "All of R^n is invariant.")
     try:
         usable = bool(np.isfinite(X_f.extent).all()) and framed("X_f", X_f.G, X_f.g).bounded
     except Flat:
         usable = False
     if not usable:
-        sentence = f"K does not show it, and the set is unbounded or flat{role}: not decided."
+        sentence = "K does not show it, and the set is unbounded or flat: not decided."
         return check(None, None, sentence)
     body = Polytope(X_f.G, X_f.g)
     before = step.back(body)
     if before.is_empty():
-        sentence = f"From no state can an admissible input reach the terminal set{role}."
+        sentence = f"From no state can an admissible input reach {X_f.called}."
         return check(False, -np.inf, sentence)
     cut = largest_cut(before, body)
     if cut <= _TOUCH:
         sentence = (
-            f"K does not show it, but every state of the set has an admissible input that keeps "
-            f"it in: no row of Pre(X_f) cuts X_f (upper bounds from LPs){role}."
+            "K does not show it, but every state of the set has an admissible input that keeps "
+            "it in: no row of Pre(X_f) cuts X_f (upper bounds from LPs)."
         )
         return check(True, -cut, sentence)
     H, h = before.unit_rows()
@@ -482,7 +483,7 @@ def _control_invariance(
     worst = int(np.argmax([top.value - limit for top, limit in zip(tops, h, strict=True)]))
     state = np.array2string(np.asarray(tops[worst].x) + 0.0, precision=6, separator=", ")
     sentence = (
-        f"No admissible input keeps x = {state} in the set{role}; Pre(X_f) cuts off "
+        f"No admissible input keeps x = {state} in the set; Pre(X_f) cuts off "
         f"{cut:.3g} of the set's extent there."
     )
     return check(False, -cut, sentence)

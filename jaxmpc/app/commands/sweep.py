@@ -315,6 +315,8 @@ def conclude(found: StoredMap, config: configs.Config, output: Path, start: floa
         ("total", f"{seconds:.2f} s with bounds and files"),
         ("files", " ".join(files)),
     ]
+    if len(axes) != 2:
+        rows.append(("picture", f"none: map.png shows two axes, and this map has {len(axes)}"))
     print_table(rows, 12)
 
 

@@ -1,0 +1,68 @@
+"""Cures that error messages and statuses name: they are tried, and they help."""
+
+import numpy as np
+import pytest
+
+import jaxmpc as jm
+
+SYSTEM = jm.LinearSystem([[1, 0.1], [0, 1]], [0.005, 0.1], dt=0.1)
+BOX = jm.Box([-1, -1], [1, 1])
+
+
+def problem(horizon=5, **fields):
+    return jm.MPC(SYSTEM, [1, 1], 0.1, horizon, states=BOX, inputs=jm.Box(-1, 1), **fields)
+
+
+@pytest.mark.parametrize("half", [np.triu, np.tril])
+def test_one_half_of_a_symmetric_matrix(half):
+    """Half of the sum of both, the cure of other matrices, would halve what is off the diagonal."""
+    P = np.array([[4.0, 1], [1, 2]])
+    with pytest.raises(ValueError, match="P: is triangular, not symmetric") as refusal:
+        jm.QP(half(P), np.ones(2), np.eye(2), -np.ones(2), np.ones(2)).validate()
+    cure = str(refusal.value).split(" use ")[1]
+    np.testing.assert_array_equal(eval(cure, {"np": np, "P": half(P)}), P)
+    with pytest.raises(ValueError, match="Use .P . P.T. / 2"):
+        jm.QP(P + [[0, 1], [0, 0]], np.ones(2), np.eye(2), -np.ones(2), np.ones(2)).validate()
+
+
+def test_a_longer_horizon_helps_with_a_terminal_set_alone():
+    """X_{N+1} ⊆ X_N without one: what has no plan over N steps has none over more."""
+    cure = "with a terminal set enlarge that or lengthen the horizon"
+    assert cure in jm.Status.PRIMAL_INFEASIBLE.sentence
+    near, far = (jm.feasible_polytope(problem(N)) for N in (2, 8))
+    assert far.is_subset(near) and far.volume() < near.volume()
+    small = jm.Box([-0.1, -0.1], [0.1, 0.1])
+    near, far = (jm.feasible_polytope(problem(N, terminal_set=small)) for N in (2, 8))
+    assert far.volume() > near.volume()
+
+
+def test_a_number_weighs_the_rate_of_one_input():
+    one, other = (problem(input_rate_weight=W) for W in (0.01, [[0.01]]))
+    one.validate()
+    plans = [jm.solve(mpc, [0.5, 0.1], previous_input=[0.3]) for mpc in (one, other)]
+    np.testing.assert_array_equal(plans[0].inputs, plans[1].inputs)
+
+
+def test_points_of_a_map_with_limited_rates():
+    """The message names the columns that are missing; with them the map is made."""
+    mpc = problem(input_rate_limit=0.2)
+    with pytest.raises(ValueError, match=r"points \(B, 3\): states, then previous inputs"):
+        jm.map_feasible_set(mpc, np.zeros((3, 2)))
+    assert jm.map_feasible_set(mpc, np.zeros((3, 3))).label.tolist() == [1, 1, 1]
+
+
+def test_hypotheses_name_no_terminal_set_that_is_not_there():
+    report = jm.sets.verify_terminal(
+        SYSTEM, np.eye(2), 0.1, None, None, states=BOX, inputs=jm.Box(-1, 1)
+    )
+    assert "lies within X, 1 from its boundary" in str(report)
+    assert "the terminal set" not in str(report).replace("requires a terminal set", "")
+
+
+def test_lost_states_between_the_points_of_a_grid():
+    """0.05 % of X_4 is lost, less than the distance of a grid's points: samples lie in it."""
+    joint = jm.LinearSystem([[1, 0.01], [0, 1]], [0, 0.2], dt=0.01)
+    limits = {"states": jm.Box([-1.5, -2], [1.5, 2]), "inputs": jm.Box(-2, 2)}
+    report = jm.recursive_feasibility(jm.MPC(joint, [50, 1], 0.1, 4, **limits), steps=5)
+    assert report.law.holds is False and 0 < report.lost_by_law < 1e-3 * report.volume
+    assert report.loops.counts()["lost after one step"] > 0
