@@ -5,6 +5,7 @@ sweep_into           label a grid into a store, block by block -> StoredMap
 boundary             points and facets on the boundary along rays -> Boundary
 feasible_polytope    the whole set as a Polytope
 feasible_growth      how it grows with the horizon -> Growth
+sample_feasible_set  states that are uniform on the set, with proofs -> FeasibleSamples
 feasible_fraction    the share of states that are feasible, with a derivative
 grid                 points of a regular grid
 StoredMap            the map that such a store holds, read block by block
@@ -15,6 +16,7 @@ from jaxmpc.feasible.map import map_feasible_set
 from jaxmpc.feasible.polytope_growth import feasible_growth, feasible_polytope
 from jaxmpc.feasible.smooth_fraction import feasible_fraction
 from jaxmpc.feasible.stored import StoredMap, sweep_into
+from jaxmpc.feasible.uniform_samples import sample_feasible_set
 from jaxmpc.grids import grid
 
 __all__ = [
@@ -25,5 +27,6 @@ __all__ = [
     "feasible_polytope",
     "grid",
     "map_feasible_set",
+    "sample_feasible_set",
     "sweep_into",
 ]

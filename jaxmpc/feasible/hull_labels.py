@@ -54,7 +54,8 @@ class Hull:
     """Cones about center (d,): M (F, d, d) and gauge (F, d) of each, the least λ_i and the largest
     gauge (F,) of points that are labelled; inputs and, in a projection, free states value + slope_i
     (θ − center), value (v,), slope (F, v, d). Half-spaces normals (K, d) θ ≤ offsets (K,) that hold
-    on the whole feasible set, and the cuts that they follow from."""
+    on the whole feasible set, and the cuts that they follow from. gap: the fraction of their volume
+    that the hull lacks."""
 
     # Arrays of NumPy, or on a device.
     center: Any
@@ -67,6 +68,7 @@ class Hull:
     normals: Any
     offsets: Any
     cuts: proofs.Cut
+    gap: Any
 
     @classmethod
     def of(cls, problem: FeasibilityProblem) -> "Hull | None":
@@ -96,7 +98,7 @@ class Hull:
         least, most = label_limits(rays.exact, theta, value, facets, M)
         gauge, slope = M.sum(axis=1), edges_of(value, facets) @ M
         _, _, normals, offsets, cuts = proved
-        return cls(center, M, gauge, least, most, value[-1], slope, normals, offsets, cuts)
+        return cls(center, M, gauge, least, most, value[-1], slope, normals, offsets, cuts, gap)
 
 
 def edges_of(values: np.ndarray, facets: np.ndarray) -> np.ndarray:
@@ -185,7 +187,7 @@ def vertex_values(
 _made: WeakKeyDictionary[FeasibilityProblem, Hull | None] = WeakKeyDictionary()
 
 
-def hull_for(problem: FeasibilityProblem, points: int) -> Hull | None:
+def hull_for(problem: FeasibilityProblem, points: float) -> Hull | None:
     """Return the hull of a problem if so many points are worth the rays, or if they were made for
     it before; None else, and where it has none."""
     least = MANY * 4.0 ** (problem.dimension - 2) * (1 if jax.default_backend() == "cpu" else 8)

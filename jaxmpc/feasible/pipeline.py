@@ -211,6 +211,15 @@ class Labels:
         proofs = {name: head(proof) for name, proof in self.proofs.items()}
         return replace(self, label=self.label[:count], status=self.status[:count], proofs=proofs)
 
+    def rows(self, index: np.ndarray) -> "Labels":
+        """Return the labels of the points at these indices, with their proofs."""
+
+        def some(proof: OnDemand[np.ndarray]) -> OnDemand[np.ndarray]:
+            return OnDemand(lambda: proof.get()[index])
+
+        proofs = {name: some(proof) for name, proof in self.proofs.items()}
+        return replace(self, label=self.label[index], status=self.status[index], proofs=proofs)
+
     def changed(
         self,
         where: np.ndarray,
