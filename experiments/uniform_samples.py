@@ -1,6 +1,6 @@
 """Uniform samples of feasible sets of 2 to 12 states: time, proofs, and tests of their law.
 
-    python experiments/uniform_samples.py [--count 1000000] [--states 2 3 4 6 8 10 12]
+    python experiments/uniform_samples.py [--count 1000000] [--states 2 3 4 6 8 10 12] [--seed 1]
 
 The sets are products of joints (and, for an odd n, of a scalar plant) behind a
 unimodular change of coordinates that hides the product from the sampler. So the law is known: in
@@ -148,6 +148,7 @@ def main() -> None:
     options.add_argument("--states", type=int, nargs="+", default=[2, 3, 4, 6, 8, 10, 12])
     options.add_argument("--horizon", type=int, default=5)
     options.add_argument("--method", default="auto")
+    options.add_argument("--seed", type=int, default=1)
     options.add_argument("--no-programs", action="store_true")
     given = options.parse_args()
     print(
@@ -158,7 +159,7 @@ def main() -> None:
         parts = blocks(n, given.horizon)
         mpc, back = hidden(parts, n)
         one = lambda count, of=mpc: jm.feasible.sample_feasible_set(
-            of, count, seed=1, method=given.method
+            of, count, seed=given.seed, method=given.method
         )
         begun = time.process_time()
         one(given.count if given.count < 2**17 else 2**17)  # compiles

@@ -63,7 +63,7 @@ def plot_regions(
         ax.add_collection(polygons)
         title = f"{len(seen)} critical regions, darker where more rows are active"
     else:
-        lines = [np.linspace(*ends, GRID) for ends in frame]
+        lines = [np.linspace(low, high, GRID) for low, high in frame]
         points = np.tile(theta, (GRID * GRID, 1))
         points[:, list(axes)] = np.stack(np.meshgrid(*lines), axis=-1).reshape(-1, 2)
         values = regions.value(points) if show == "value" else regions.law(points)[:, output]
