@@ -187,7 +187,8 @@ class PolicyHull:
         off = 4 * (largest_row_sum(np.eye(d) - M @ edges) + 4 * proofs.gamma(d + 3) * size)
         gauge, slope = M.sum(axis=1), edges_of(w, facets) @ M
         _, _, normals, offsets, cuts = bounds
-        hull = Hull(rays.center, M, gauge, off, 1 - d * off, w[-1], slope, normals, offsets, cuts)
+        least = off, 1 - d * off
+        hull = Hull(rays.center, M, gauge, *least, w[-1], slope, normals, offsets, cuts, left)
         return cls(rays, hull, bounds, left)
 
     def policies(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
