@@ -364,22 +364,27 @@ class Polytope(LinearSet):
             M: (k, n), any matrix: the image is flat where M has a rank below k.
             t: (k,), or None for 0.
 
-        With k < n, y = M x is solved for k entries of x, which leaves the set of all (y, rest
-        of x); `project` then eliminates the rest. Of a matrix whose rank is r < k, r rows make a
-        set with volume, and the others are combinations of them. Rank is told to 1e-9, whatever
-        the units.
+        Row by row where M is square and invertible, with a condition number up to 1e7 in scaled
+        rows and columns; else the hull of the images of the vertices, of bounded sets in up to six
+        dimensions. Of others y = M x is solved for k entries of x, which leaves the set of all (y,
+        rest of x); `project` then eliminates the rest. There, of a matrix whose rank is r < k, r
+        rows make a set with volume, and the others are combinations of them. Rank is told to
+        1e-9, whatever the units.
 
         Raises ValueError as `project` does.
         """
         M, t = affine_map(M, t, (None, self.dimension))
         k, n = M.shape
-        own, others, C = polyhedra.independent_rows(M)
-        if len(own) == k == n:
+        if polyhedra.well_conditioned(M):
             inverse = np.linalg.inv(M)
             return self.preimage(inverse, -inverse @ t)
+        corners = _vertices_of(self) if n <= polyhedra.TRIANGULATED else None
+        if corners is not None and len(corners):
+            return Polytope.from_points(corners @ M.T + t)
         hull = self._hull()
         if hull is None:
             return Polytope.empty(k)
+        own, others, C = polyhedra.independent_rows(M)
         if hull.equal.any():
             if not hull.basis.shape[1]:
                 return _point(M @ hull.shift + t)

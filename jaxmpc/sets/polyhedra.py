@@ -124,8 +124,17 @@ def _unscaled(
     normals: np.ndarray, offsets: np.ndarray, scale: np.ndarray, center: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     normals = normals / scale
-    size = np.abs(offsets) + np.abs(normals) @ np.abs(center)
+    size = np.abs(offsets) + np.abs(normals) @ (np.abs(center) + scale)
     return unit_rows(normals, cleaned(offsets + normals @ center, size))
+
+
+def well_conditioned(M: np.ndarray) -> bool:
+    """Return whether a matrix is square and has an inverse that is exact to about 1e-9, whatever
+    the units of its rows and columns."""
+    if M.shape[0] != M.shape[1] or not (M.any(axis=0).all() and M.any(axis=1).all()):
+        return False
+    row, column = scaling(M, np.zeros(len(M)))
+    return bool(np.linalg.cond(row[:, None] * M * column) <= 1e7)
 
 
 def independent_rows(M: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -388,3 +388,27 @@ def test_sets_compare_with_sets_only_and_have_no_hash():
     assert square == square + [1e-12, 0] and square != square + [1e-6, 0]
     with pytest.raises(TypeError, match="unhashable"):
         hash(square)
+
+
+@pytest.mark.parametrize("seed", [1, 358, 679])
+def test_flat_hulls_in_other_units_against_their_points(seed):
+    """Hulls of points in planes of any dimension: all truths are maxima over points. (In two of
+    these rounding once made rows of 1e-21, and an image lost digits.)"""
+    rng = np.random.default_rng(seed)
+    for n, r in ((2, 1), (3, 1), (3, 2), (4, 2)):
+        unit = 10.0 ** rng.uniform(-6, 6, n)
+        make = lambda r, n=n, unit=unit: (
+            unit * (rng.normal(size=n) + rng.normal(size=(r + 3, r)) @ rng.normal(size=(r, n)))
+        )
+        V, W = make(r), make(1)
+        P, Q = Polytope.from_points(V), Polytope.from_points(W)
+        assert P.affine_dimension() == r and P.reduce() == P
+        M = rng.normal(size=(3, 2)) @ rng.normal(size=(2, n)) / unit
+        for found, points in (
+            (P + Q, (V[:, None] + W).reshape(-1, n)),
+            (M @ P, V @ M.T),
+            (P.project([n - 1, 0]), V[:, [n - 1, 0]]),
+        ):
+            size = np.abs(points).max(axis=0)
+            d = rng.normal(size=(10, points.shape[1])) / size
+            np.testing.assert_allclose(found.support(d), (d @ points.T).max(axis=1), atol=1e-9)
