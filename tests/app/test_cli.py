@@ -1,5 +1,6 @@
 """The command: files and table when all is well, one line and an exit code when not."""
 
+import io
 import json
 import shlex
 import shutil
@@ -135,7 +136,8 @@ def test_file_slice_and_overwrite(tmp_path, capsys):
     assert "sweep.fixed: [0.25] there, [0.5] here" in capsys.readouterr().err
     command = "sweep --config case.toml --axes 0 --grid 5 --fixed 0 0.5 --output out --overwrite"
     assert run(command) == 0
-    assert "length from" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "length from" in out and "none: map.png shows two axes, and this map has 1" in out
 
 
 @pytest.fixture
@@ -496,6 +498,15 @@ def test_help_and_version_do_without_jax(words):
     )
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert said.stdout.splitlines()[-1] == "[]"
+
+
+def test_output_in_an_encoding_that_lacks_characters(monkeypatch):
+    """The unit of the area, rad·rad/s, has no place in ASCII: "?" is printed, and nothing fails."""
+    out = io.TextIOWrapper(io.BytesIO(), "ascii")
+    monkeypatch.setattr(sys, "stdout", out)
+    assert run("sweep --grid 16 12 --horizon 5 --output out") == 0
+    out.seek(0)
+    assert "rad?rad/s (inner bound)" in out.read()
 
 
 def test_version_and_module_entry():

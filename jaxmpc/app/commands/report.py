@@ -98,7 +98,9 @@ def folder_page(folder: Path) -> str:
     Raises ValueError where there are none, and where they are damaged.
     """
     found = next((folder / name for name in RESULTS if (folder / name).exists()), None)
-    document = json.loads(text_within(found or folder / RESULTS[0]))
+    if found is None:
+        raise ValueError(f"it holds none of {', '.join(RESULTS)}")
+    document = json.loads(text_within(found))
     if not isinstance(document, dict) or not isinstance(document.get("config", {}), dict):
         fail(str(folder), "holds other results than commands write", "Run the command again")
     document.pop("digest", None)
