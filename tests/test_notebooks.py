@@ -13,7 +13,7 @@ SOURCES = sorted(FOLDER.glob("[0-9]*.py"))
 
 
 def test_the_course_is_complete():
-    assert [path.stem[:2] for path in SOURCES] == [f"{k:02}" for k in range(9)]
+    assert [path.stem[:2] for path in SOURCES] == [f"{k:02}" for k in range(10)]
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda path: path.stem)

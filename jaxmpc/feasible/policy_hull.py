@@ -11,7 +11,7 @@ infeasible. The few points between get a ray of their own.
 import functools
 import time
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 import jax
@@ -20,6 +20,7 @@ import numpy as np
 from jax import Array
 from scipy.spatial import QhullError
 
+from jaxmpc.arrays import Reals, host_array
 from jaxmpc.batches import Compiled, Devices, chosen_devices, default_chunk, over_devices, padded
 from jaxmpc.checks import fail
 from jaxmpc.feasible import proofs
@@ -40,9 +41,16 @@ from jaxmpc.feasible.pipeline import (
     OnDemand,
     compiled_ends,
 )
-from jaxmpc.feasible.policy_problem import HalfSpace, PolicyProblem, rounded
+from jaxmpc.feasible.policy_problem import (
+    HalfSpace,
+    PolicyProblem,
+    directions,
+    problem_of,
+    rounded,
+)
 from jaxmpc.feasible.proofs import Cut, Verdict
 from jaxmpc.feasible.rays import BACKOFFS, Boundary, ProvedBounds, close_gap, leaving
+from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import record
 from jaxmpc.qp.status import Status
 
@@ -261,6 +269,36 @@ def policy_hull(problem: PolicyProblem) -> PolicyHull:
     if problem not in _made:
         _made[problem] = PolicyHull.of(problem)
     return _made[problem]
+
+
+class AffinePolicies(NamedTuple):
+    """u_k = plan_k + Σ_{j<k} feedback_kj w_j for each of B states: plan (B, N, m), feedback
+    (B, N, m, N, p), zero for j ≥ k; NaN for states that have none."""
+
+    plan: np.ndarray
+    feedback: np.ndarray
+
+
+def affine_policies(mpc: MPC | PolicyProblem, x0s: Reals) -> AffinePolicies:
+    """Return an affine policy of each state that keeps all limits under every disturbance.
+
+    mpc: a problem with policy="affine", or the `problem` of its map, whose rays are sent already.
+    x0s: states (B, n), or points of a slice. The policies are combinations of those at the ends of
+    rays, which are proved in rational arithmetic; numbers here are rounded. They hold for what was
+    asked, and minimise no cost. Raises ValueError as `map_feasible_set` does.
+    """
+    problem = mpc if isinstance(mpc, PolicyProblem) else problem_of(mpc)
+    if not isinstance(problem, PolicyProblem) or problem.mpc.policy != "affine":
+        fail("mpc", "has no affine policy", 'Give MPC(disturbance=..., policy="affine")')
+    points = host_array("x0s", x0s)
+    if points.ndim != 2 or points.shape[1] != problem.dimension:
+        fail("x0s", f"shape {points.shape}", f"Give points (B, {problem.dimension})")
+    v, M = policy_hull(problem).policies(points)
+    center, gamma = (np.asarray(part, float) for part in directions(problem.mpc))
+    (B, _), N, m, p = v.shape, problem.mpc.horizon, problem.mpc.system.m, len(center)
+    answers = M.reshape(B, N, m, N, gamma.shape[1]) @ np.linalg.pinv(gamma)
+    plan = v.reshape(B, N, m) - np.einsum("bimjp,p->bim", answers, center)
+    return AffinePolicies(plan, answers.reshape(B, N, m, N, p))
 
 
 def policy_labels(

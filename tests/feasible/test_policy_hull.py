@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import linprog
 
 import jaxmpc as jm
-from jaxmpc.feasible import boundary, feasible_polytope
+from jaxmpc.feasible import affine_policies, boundary, feasible_polytope
 from jaxmpc.feasible.policy_hull import policy_hull
 from jaxmpc.feasible.policy_problem import problem_of
 from jaxmpc.sets import minimal_robust_invariant_set
@@ -273,3 +273,29 @@ def test_tubes():
     each = zip(inside, plans, strict=True)
     assert max(worst_of_tube(mpc, *one) for one in each) <= 1e-9
     assert jm.recursive_feasibility(mpc).strong.holds
+
+
+def test_policies_in_units_of_the_disturbances():
+    """u = plan + feedback w, with W off centre, keeps all limits at every vertex sequence."""
+    W = jm.Box([-0.2, -0.1], [0.05, 0.2])
+    mpc = double(disturbance=W, horizon=3)
+    points = np.random.default_rng(0).uniform([-5, -2], [5, 2], (40, 2))
+    labels = jm.map_feasible_set(mpc, points).label
+    plan, feedback = affine_policies(mpc, points)
+    assert plan.shape == (40, 3, 1) and feedback.shape == (40, 3, 1, 3, 2)
+    np.testing.assert_array_equal(np.isfinite(plan).all(axis=(1, 2)), labels == 1)
+    assert np.all(feedback[labels == 1][:, 0] == 0) and np.all(
+        feedback[labels == 1][:, 2, :, 2] == 0
+    )
+    w = np.array(list(itertools.product(W.vertices(), repeat=3)))
+    H, h = mpc.terminal_set.half_spaces()
+    for x0, v, M in zip(points[labels == 1], plan[labels == 1], feedback[labels == 1], strict=True):
+        x = np.tile(x0, (len(w), 1))
+        for k in range(3):
+            assert np.all(np.abs(x) <= [5 + 1e-9, 2 + 1e-9])
+            u = v[k] + np.einsum("ajp,bjp->ba", M[k], w)
+            assert np.abs(u).max() <= 1 + 1e-9
+            x = x @ A.T + u @ B.T + w[:, k]
+        assert np.max(x @ H.T - h) <= 1e-9
+    with pytest.raises(ValueError, match="has no affine policy"):
+        affine_policies(double(policy="tightened"), points)
