@@ -17,6 +17,7 @@ Printed for each:
 """
 
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,6 +34,8 @@ from jaxmpc.closed_loop import (
     draw_robots,
     randomised,
 )
+
+COLUMNS = ("kept", "worst", "error", "largest", "soft", "solved", "seconds")
 
 
 @dataclass(frozen=True)
@@ -53,8 +56,8 @@ class Settings:
     seed: int = 0
 
 
-def run(s: Settings) -> dict[str, dict[str, float]]:
-    """Run both loops from the same starts with the same payloads; return the numbers of each."""
+def run(s: Settings) -> Iterator[tuple[str, dict[str, float]]]:
+    """Run both loops from the same starts with the same payloads; yield the numbers of each."""
     robot = jm.load_robot(s.robot)
     mpc = jm.robot_mpc(robot, horizon=s.horizon)
     plain = jm.RobotController(robot, mpc, linearize="set-point")
@@ -76,32 +79,32 @@ def run(s: Settings) -> dict[str, dict[str, float]]:
         "chunk": s.chunk,
     }
     x0s, _ = draw_robots(robot, s.loops, s.seed, spread=s.spread)
-    steps, found = round(s.seconds / robot.dt), {}
+    steps = round(s.seconds / robot.dt)
     for name, controller in (("offset-free", free), ("plain", plain)):
         begin = time.perf_counter()
         runs = jm.simulate_many(controller, robot, x0s, steps, **given)
         seconds = time.perf_counter() - begin
         worst = runs.violation.max(axis=1)
         error = np.abs(runs.states[:, -1, :nv] - x[:nv]).max(axis=1)
-        found[name] = {
-            "kept": float(np.mean(worst <= 1e-6)),
-            "worst": float(worst.max()),
-            "error": float(np.median(error)),
-            "largest": float(error.max()),
-            "soft": float(runs.fallback.mean()),
-            "solved": float(np.mean(runs.status == jm.Status.SOLVED)),
-            "seconds": seconds,
-        }
-    return found
+        yield (
+            name,
+            {
+                "kept": float(np.mean(worst <= 1e-6)),
+                "worst": float(worst.max()),
+                "error": float(np.median(error)),
+                "largest": float(error.max()),
+                "soft": float(runs.fallback.mean()),
+                "solved": float(np.mean(runs.status == jm.Status.SOLVED)),
+                "seconds": seconds,
+            },
+        )
 
 
 def main(settings: Settings) -> None:
     """Print the table."""
-    found = run(settings)
-    names = list(next(iter(found.values())))
-    print(f"{'':12}" + "".join(f"{name:>10}" for name in names))
-    for name, row in found.items():
-        print(f"{name:12}" + "".join(f"{row[key]:10.4g}" for key in names))
+    print(f"{'':12}" + "".join(f"{name:>10}" for name in COLUMNS))
+    for name, row in run(settings):
+        print(f"{name:12}" + "".join(f"{row[key]:10.4g}" for key in COLUMNS), flush=True)
 
 
 if __name__ == "__main__":

@@ -44,6 +44,7 @@ def least_squares(mpc, moves):
     return np.linalg.lstsq(J, -base, rcond=None)[0][moves][:, None], base, J
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize(
     "fields",
     [
@@ -66,6 +67,7 @@ def test_least_squares(fields):
     np.testing.assert_allclose(plan.cost, residual @ residual, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_limits_are_kept_under_the_forecast():
     """Active limits of states, outputs and inputs; the other transcription has c at each step."""
     mpc = replace(
