@@ -336,6 +336,8 @@ class GivenProgram(NamedTuple):
             fail("within", what, "Solve that one QP")
         rows = np.where(np.abs(Vt[:rank]) <= 1e-14, 0.0, Vt[:rank])
         offsets = rows @ np.linalg.lstsq(both[:, :n], both[:, n], rcond=FLAT)[0]
+        # What is rounding here would be the only limit of rows through the origin.
+        offsets = np.where(np.abs(offsets) <= 1e-14, 0.0, offsets)
         basis, free = plain_null_space(rows)
         shift = column[:n] * np.linalg.lstsq(rows, offsets, rcond=None)[0]
         basis = column[:n, None] * basis / column[free]
@@ -469,15 +471,16 @@ def least_distance_form(
     window = Window.of(Program(np.hstack([-V, M]), v), scaling(V, v)[1], reach)
     if window.open:
         H, h = window.rows()
-        given, none = given.within(window), np.zeros(len(h))
-        M, V, v = (
-            np.vstack([M, np.zeros((len(h), M.shape[1]))]),
-            np.vstack([V, -H]),
+        k = len(h)
+        given = given.within(window)
+        M, V = np.vstack([M, np.zeros((k, M.shape[1]))]), np.vstack([V, -H])
+        v, length, side = (
             np.append(v, h),
+            np.append(length, np.ones(k)),
+            np.append(side, np.ones(k)),
         )
-        row, side = np.append(row, none - 2).astype(int), np.append(side, none + 1)
-        length, zero_row = np.append(length, none + 1), np.append(zero_row, none == 0)
-        hull = hull._replace(equal=np.append(hull.equal, none != 0))
+        row, zero_row = np.append(row, np.full(k, -2)), np.append(zero_row, np.full(k, True))
+        hull = hull._replace(equal=np.append(hull.equal, np.full(k, False)))
     low, high = window.lower, window.upper
     center, size = (high + low) / 2, (high - low) / 2
     if np.any(size <= ROUNDING * np.abs(center)):

@@ -188,7 +188,7 @@ class TestOfAnMPC:
                 error, off = x - x_r[k], inputs - u_r[k]
                 total += error @ np.asarray(mpc.Q) @ error + off @ np.asarray(mpc.R) @ off
                 if mpc.input_rate_weight is not None:
-                    total += float(mpc.input_rate_weight[0] * (inputs - before)[0] ** 2)
+                    total += np.ravel(mpc.input_rate_weight)[0] * (inputs - before)[0] ** 2
                 x, before = A @ x + B @ inputs, inputs
             np.testing.assert_allclose(u, z[:1], atol=1e-8)
             assert v == pytest.approx(total, rel=1e-8)
