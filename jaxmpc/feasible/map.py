@@ -69,6 +69,23 @@ class FeasibleSetMap:
         return self.problem.mpc
 
     @property
+    def claim(self) -> str:
+        """Return what the labels 1 and −1 say, in a sentence: of a robust problem they are claims
+        about a class of policies."""
+        mpc = self.mpc
+        if mpc.disturbance is None:
+            return "Feasible: some plan keeps all limits; infeasible: none does."
+        kinds = {
+            "tightened": "a plan with the feedback of the gain",
+            "tube": "a tube of the gain about a nominal plan",
+            "affine": "an affine policy",
+        }
+        return (
+            f"Feasible: {kinds[mpc.policy]} keeps all limits under every disturbance; infeasible: "
+            "no policy of this class does, others may (any_policy_polytope)."
+        )
+
+    @property
     def axes(self) -> tuple[int, ...]:
         """Return the indices of the d mapped states."""
         return self.problem.view.axes

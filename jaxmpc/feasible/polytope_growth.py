@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxmpc.checks import fail
+from jaxmpc.checks import fail, require_kind
 from jaxmpc.feasible.plan_polytope import DIMENSIONS, FACETS, CenteredPolytope, projected
 from jaxmpc.feasible.policy_problem import problem_of
 from jaxmpc.mpc.problem import MPC
@@ -46,6 +46,31 @@ def feasible_polytope(mpc: MPC) -> Polytope:
     if isinstance(body, str):
         fail("mpc", body, "Map it with map_feasible_set, which has no such limit")
     return body.polytope
+
+
+def any_policy_polytope(mpc: MPC) -> Polytope:
+    """Return the states from which some policy keeps all limits under every disturbance: one whose
+    inputs may be any function of the states so far.
+
+    By dynamic programming, N steps of `predecessor` from the terminal set (without one, from the
+    state limits): exact to rounding, whatever the policy of `mpc` is, whose sets lie inside it. A
+    state outside is infeasible for every policy. Works as far as elimination goes. Raises
+    ValueError for other limits than those of states and inputs at the usual steps, an ellipsoidal
+    terminal set, and as `predecessor` does.
+    """
+    require_kind("mpc", mpc, MPC)
+    mpc.validate()
+    if not is_standard_form(mpc) or not mpc.constrain_initial or mpc.states is None or mpc.soft:
+        what = "has other limits than those of states and inputs at the usual steps"
+        fail("mpc", what, "Give it without them")
+    if isinstance(mpc.terminal_set, Ellipsoid):
+        fail("terminal_set", "is an Ellipsoid, which has no facets", "Give a Polytope")
+    last: Any = mpc.terminal_set
+    body, count = (mpc.states, mpc.horizon - 1) if last is None else (last, mpc.horizon)
+    sides = mpc.states, mpc.inputs, mpc.disturbance, mpc.disturbance_matrix
+    for _ in range(count):
+        body = predecessor(mpc.system, body, *sides)
+    return body if isinstance(body, Polytope) else body.to_polytope()
 
 
 @record

@@ -8,7 +8,12 @@ import pytest
 from scipy.optimize import linprog
 
 import jaxmpc as jm
-from jaxmpc.feasible import affine_policies, boundary, feasible_polytope
+from jaxmpc.feasible import (
+    affine_policies,
+    any_policy_polytope,
+    boundary,
+    feasible_polytope,
+)
 from jaxmpc.feasible.policy_hull import policy_hull
 from jaxmpc.feasible.policy_problem import problem_of
 from jaxmpc.sets import minimal_robust_invariant_set
@@ -107,6 +112,7 @@ def least_violation(mpc: jm.MPC, x0: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("seed", range(6))
+@pytest.mark.first(3)
 def test_no_label_is_wrong(seed):
     """States labelled feasible keep all limits under every sequence by the policy that is given;
     for those nearest to the boundary that are labelled infeasible, no policy exists."""
@@ -140,6 +146,10 @@ def test_the_double_integrator_of_the_literature():
     for _ in range(5):
         exact = jm.sets.predecessor(SYSTEM, exact, X, U, W)
     np.testing.assert_allclose(exact.volume(), 35.7903, atol=5e-5)
+    any_policy = any_policy_polytope(mpc)
+    np.testing.assert_allclose(any_policy.volume(), exact.volume(), rtol=1e-12)
+    with pytest.raises(ValueError, match="has other limits"):
+        any_policy_polytope(double(policy="tightened", input_rate_limit=1.0))
     found = feasible_polytope(mpc)
     assert found.is_subset(exact, 1e-7)
     np.testing.assert_allclose(found.volume(), 35.7903, atol=1e-4)
@@ -156,6 +166,7 @@ def test_all_sequences_of_combined_policies():
     problem = problem_of(mpc)
     points = np.random.default_rng(0).uniform([-5, -2], [5, 2], (300, 2))
     found = jm.map_feasible_set(problem, points)
+    assert found.claim.startswith("Feasible: an affine policy keeps all limits under every")
     inside = points[found.label == 1][:60]
     v, M = policy_hull(problem).policies(inside)
     assert max(worst_by_sequences(mpc, *each) for each in zip(inside, v, M, strict=True)) <= 1e-11

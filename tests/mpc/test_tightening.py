@@ -138,6 +138,7 @@ def test_no_disturbance_has_the_nominal_answers_bit_for_bit():
         np.testing.assert_array_equal(values, two[name])
 
 
+@pytest.mark.slow
 def test_plans_keep_all_limits_under_every_sequence():
     """And touch one of them: the tightening is no larger than it has to be."""
     last = jm.maximal_invariant_set(
