@@ -13,7 +13,7 @@ Printed for each:
     seconds     of computing, compiling included
 
     python experiments/robots/payloads.py --robot arm2 --loops 256
-    python experiments/robots/payloads.py --robot arm7 --loops 4096        # for a GPU
+    python experiments/robots/payloads.py --loops 4096 --seconds 1 --spread 0.1 --drift 0.005  # GPU
 """
 
 import time
