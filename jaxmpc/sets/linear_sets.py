@@ -45,7 +45,6 @@ from jaxmpc.sets.geometry import AffineHull, Empty, Flat, Frame, framed
 from jaxmpc.sets.lp import Program, cleaned, extent, scaling
 from jaxmpc.sets.operations import BasicSet, ConvexSet, sample_size
 
-_MOST_SUMS = 300_000  # pairs of vertices of which a Minkowski sum is the hull, at most
 _MOST_VERTICES = 100_000  # corners of a box that are listed
 
 
@@ -447,9 +446,8 @@ class Polytope(LinearSet):
         Arguments:
             other: Box, Polytope, Zonotope, or points (k, n), which stand for their convex hull.
 
-        Of bounded sets, flat ones too, the hull of all sums of vertices, up to 300,000. Else, and
-        above six dimensions where the sets are products of smaller ones, the projection to x of
-        {(x, w) : x - w in the set, w in other}.
+        Of bounded sets in up to six dimensions, flat ones too, the hull of sums of vertices. Else
+        the projection to x of {(x, w) : x - w in the set, w in other}, by elimination.
 
         Raises ValueError for an Ellipsoid, or as `project` does.
         """
@@ -463,10 +461,12 @@ class Polytope(LinearSet):
         corners = _corners(other, n)
         if corners is not None and len(corners) == 1:
             return self.translate(corners[0]).reduce()
-        vertices = _vertices_of(self) if corners is not None else None
-        many = 0 if corners is None or vertices is None else len(corners) * len(vertices)
-        if corners is not None and vertices is not None and 0 < many <= _MOST_SUMS:
-            return Polytope.from_points((vertices[:, None] + corners).reshape(-1, n))
+        low = n <= polyhedra.TRIANGULATED and corners is not None
+        vertices = _vertices_of(self) if low else None
+        if corners is not None and vertices is not None:
+            if not len(vertices):
+                return Polytope.empty(n)
+            return Polytope(*polyhedra.hull_of_sums(vertices, corners))
         # x = s + D w + shift with s in the set and w in `weights`.
         if isinstance(other, LinearSet):
             D, shift, weights = np.eye(n), np.zeros(n), as_polytope("other", other)

@@ -20,6 +20,9 @@ from jaxmpc.sets.lp import FLAT, ROUNDING, cleaned, scaling
 
 # Samples are drawn from a triangulation in up to so many dimensions.
 TRIANGULATED = 6
+_FEW_SUMS = 1000  # so many sums of points are all handed to qhull
+# Vertices of a hull of sums, by dimension: it may have 100 times as many facets.
+_MOST_VERTICES = {5: 4000, 6: 1000}
 
 
 def full_part(G: np.ndarray, g: np.ndarray, argument: str = "Polytope") -> AffineHull | None:
@@ -107,6 +110,39 @@ def hull(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         normals[:, free] = inner
     H = np.vstack([E, -E, normals])
     return _unscaled(H, np.concatenate([np.zeros(2 * len(E)), offsets]), scale, center)
+
+
+def hull_of_sums(V: np.ndarray, W: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return (H, h) of the convex hull of all sums of a row of V (k, n) and one of W (m, n).
+
+    Few sums are vertices of it, and where a row of H is exceeded, by supports of both, one more is
+    found: the hull of those that are farthest along some directions grows until no row is.
+    Raises ValueError where there are too many vertices for a hull.
+    """
+    n = V.shape[1]
+    if len(V) * len(W) <= _FEW_SUMS:
+        return hull((V[:, None] + W).reshape(-1, n))
+    size = np.ptp(V, axis=0) + np.ptp(W, axis=0)
+    directions = np.random.default_rng(0).standard_normal((60 * n, n))
+    directions = np.vstack([np.eye(n), -np.eye(n), directions]) / np.where(size > 0, size, 1.0)
+    pairs, H, h = np.zeros((0, 2), int), np.zeros((0, n)), np.zeros(0)
+    most = _MOST_VERTICES.get(n, 20_000)
+    while True:
+        farthest = [np.argmax(directions @ points.T, axis=1) for points in (V, W)]
+        known = len(pairs)
+        pairs = np.unique(np.vstack([pairs, np.transpose(farthest)]), axis=0)
+        if len(pairs) > most:
+            problem = f"of the sum has more than {most} vertices in {n} dimensions"
+            fail("hull", problem, "Sum Zonotopes, or add supports")
+        if len(pairs) == known:
+            break
+        H, h = hull(V[pairs[:, 0]] + W[pairs[:, 1]])
+        reach = (H @ V.T).max(axis=1) + (H @ W.T).max(axis=1)
+        terms = np.abs(h) + np.abs(H) @ size
+        directions = H[reach - h > ROUNDING * terms]
+        if not len(directions):
+            break
+    return H, h
 
 
 def _full_hull(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -499,3 +499,16 @@ def test_subsets_scales_and_box_intersections():
 def test_set_operations_errors(call, message):
     with pytest.raises(ValueError, match=message):
         call()
+
+
+@pytest.mark.parametrize(("n", "rows"), [(4, 16), (5, 6)])
+def test_sums_of_many_vertices_by_few(n, rows):
+    """P + P = 2 P, whose 10,000 sums of vertices lie on its faces; and supports of P + Q add."""
+    rng = np.random.default_rng(n)
+    P = random_polytope(rng, n, rows=rows)
+    assert len(P.vertices()) ** 2 > 1000
+    doubled = P + P
+    assert len(doubled.h) == len(P.reduce().h) and same(doubled, P.scale(2))
+    Q = Polytope.from_points(rng.standard_normal((n + 6, n)))
+    d = rng.standard_normal((20, n))
+    np.testing.assert_allclose((P + Q).support(d), P.support(d) + Q.support(d), rtol=1e-9)
