@@ -13,7 +13,8 @@ Printed for each:
     seconds     of computing, compiling included
 
     python experiments/robots/payloads.py --robot arm2 --loops 256
-    python experiments/robots/payloads.py --loops 4096 --seconds 1 --spread 0.1 --drift 0.005  # GPU
+    python experiments/robots/payloads.py --horizon 10 --seconds 1 --spread 0.1 --drift 0.005
+    # The same of 4,096 arms, for a GPU: --loops 4096
 """
 
 import time
