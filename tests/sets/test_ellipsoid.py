@@ -55,7 +55,8 @@ def test_ellipse_boundary():
     ("ellipsoid", "message"),
     [
         (Ellipsoid(np.ones((2, 3)), 1.0), r"X_f.P: shape \(2, 3\) is not \(n, n\)"),
-        (Ellipsoid([[1, 2], [0, 1]], 1.0), "X_f.P: is not symmetric"),
+        (Ellipsoid([[1, 2], [0.5, 1]], 1.0), "X_f.P: is not symmetric"),
+        (Ellipsoid([[1, 2], [0, 1]], 1.0), "X_f.P: is triangular, not symmetric"),
         (Ellipsoid([[1, 2], [2, 1]], 1.0), "X_f.P: is not positive definite"),
         (Ellipsoid([[1, np.nan], [np.nan, 1]], 1.0), "X_f.P: holds NaN"),
         (Ellipsoid(np.eye(2), 0.0), "X_f.level: 0 is not a positive"),
