@@ -39,8 +39,8 @@ def classes():
 
 
 def test_no_class_compares_arrays():
-    """A dataclass that may hold arrays is equal to itself alone: == of arrays has no truth. Sets are
-    equal as sets, by their LPs."""
+    """A dataclass that may hold arrays is equal to itself alone: == of arrays has no truth. (Sets
+    are equal as sets, by their LPs.)"""
     scalars = {int, float, str, bool, int | None, float | None, bool | None}
     words = ("numpy", "Array", "Any", "Reals", "jaxmpc.")
     own = {"ADMM", "ConstantModel", "Switch"}  # settings, constants

@@ -113,7 +113,7 @@ KEYS = [
     ("u_min = [-1.0]", "u_min = [-1.0]\nH_x = [[1.0, 0.0]]", "limits.H_x: H_x and h_x go"),
     ("u_min = [-1.0]", "u_min = [-1.0]\nH_x = [[1.0, 0.0]]\nh_x = [1.0]", "beside x_min"),
     ("Q = [1.0, 2.0]", "Q = [1.0, -2.0]", "cost.Q: is not positive semidefinite"),
-    ("Q = [1.0, 2.0]", "Q = [[1.0, 2.0], [0.0, 1.0]]", "cost.Q: is not symmetric"),
+    ("Q = [1.0, 2.0]", "Q = [[1.0, 2.0], [0.0, 1.0]]", "cost.Q: is triangular, not symmetric"),
     ("Q = [1.0, 2.0]", "Q = [1.0]", "cost.Q: has 1 entries where 2"),
     ("Q = [1.0, 2.0]", "Q = [[1.0, 2.0, 3.0], [0.0, 1.0, 2.0]]", "cost.Q: shape"),
     ("Q = [1.0, 2.0]", 'Q = "big"', "cost.Q"),
