@@ -1095,7 +1095,7 @@ WRONG = {
     "rate weight: three": (dict(input_rate_weight=np.ones(3)), "input_rate_weight", "Give"),
     "rate weight < 0": (dict(input_rate_weight=[1.0, -1.0]), "input_rate_weight", "signs"),
     "rate weight, asymmetric": (dict(input_rate_weight=np.array([[1, 2], [0, 1.0]])),
-                                "input_rate_weight", "Use"),
+                                "input_rate_weight", "use"),
     "rate limit < 0": (dict(input_rate_limit=-1.0), "input_rate_limit", "limit ≥ 0"),
     "rate limit: three": (dict(input_rate_limit=np.ones(3)), "input_rate_limit", "Box"),
     "rate limit NaN": (dict(input_rate_limit=np.nan), "input_rate_limit", "limit ≥ 0"),
