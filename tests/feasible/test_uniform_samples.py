@@ -154,6 +154,7 @@ def test_a_curved_boundary():
     assert np.all(np.einsum("bi,ij,bj->b", x, np.diag([1.0, 0.5]), x) <= 0.8 + 1e-12)
 
 
+@pytest.mark.slow
 def test_a_data_set(samples, tmp_path):
     """Optimal plans and multipliers of the samples balance the gradient of the condensed cost."""
     plans = samples.solve()

@@ -387,7 +387,11 @@ type="capsule" mass="1" condim="{1}" friction="{2}"/></body><body pos=".1 0 .35"
 
 @pytest.mark.parametrize(
     "given, words",
-    [((1, 1, 1), "all contacts"), ((3, 1, 1), "friction of 1e-5"), ((3, 1, 2), "pyramidal ones")],
+    [
+        pytest.param((1, 1, 1), "all contacts", marks=pytest.mark.slow),
+        ((3, 1, 1), "friction of 1e-5"),
+        pytest.param((3, 1, 2), "pyramidal ones", marks=pytest.mark.slow),
+    ],
 )
 def test_contacts_without_friction_beside_elliptic_cones(given, words):
     """The same motion as in the C engine, but where no model of MJX has it, which is said."""

@@ -72,7 +72,7 @@ JORDAN = TILT @ [[1, 1, 0], [0, 1, 0], [0, 0, 0.5]] @ np.linalg.inv(TILT)
     ("A", "B", "Q", "R", "message"),
     [
         (JOINT.A, JOINT.B, -np.eye(2), np.eye(1), "Q: is not positive semidefinite"),
-        (JOINT.A, JOINT.B, [[1, 1], [0, 1]], np.eye(1), "Q: is not symmetric"),
+        (JOINT.A, JOINT.B, [[1, 1], [0, 1]], np.eye(1), "Q: is triangular, not symmetric"),
         (JOINT.A, JOINT.B, np.eye(3), np.eye(1), "Q: shape"),
         (JOINT.A, JOINT.B, np.eye(2), [[0]], "R: is not positive definite"),
         (JOINT.A, JOINT.B, np.eye(2), np.eye(2), "R: shape"),
