@@ -403,7 +403,9 @@ def _softened(mpc: MPC, rho: Reals) -> MPC:
     heavy, xp = [], np if concrete(rho) else jnp
     for rows in outputs:
         if isinstance(rows, ForceLimits):
-            of_inputs, of_states = (np.abs(part).max(axis=1) for part in (rows.D, rows.C))
+            of_inputs, of_states = (
+                np.abs(np.asarray(part)).max(axis=1) for part in (rows.D, rows.C)
+            )
             size = np.where(of_inputs > 0, of_inputs, of_states)
             names = rows.stages, rows.names, rows.units
             weight = _FORCES * xp.max(rho) / size

@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxmpc.arrays import Reals, host_array
+from jaxmpc.arrays import Reals, as_array, host_array
 from jaxmpc.checks import (
     fail,
     require_finite,
@@ -85,7 +85,7 @@ class ParametricQP:
     @property
     def dimension(self) -> int:
         """Return p, the number of parameters."""
-        return next((np.shape(v)[1] for v in (self.F, self.S) if v is not None), 0)
+        return next((np.shape(as_array(v))[1] for v in (self.F, self.S) if v is not None), 0)
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -100,10 +100,10 @@ class ParametricQP:
             value = getattr(self, name)
             if value is not None and np.ndim(value) != 2:
                 fail(name, f"shape {np.shape(value)}", "Give a matrix, one column a parameter")
-        if np.ndim(self.P) != 2 or np.ndim(self.G) != 2:
-            what = f"shapes {np.shape(self.P)} and {np.shape(self.G)}"
+        if np.ndim(as_array(self.P)) != 2 or np.ndim(as_array(self.G)) != 2:
+            what = f"shapes {np.shape(as_array(self.P))} and {np.shape(as_array(self.G))}"
             fail("P, G", what, "Give matrices (nz, nz) and (r, nz)")
-        nz, r, p = np.shape(self.P)[0], np.shape(self.G)[0], self.dimension
+        nz, r, p = np.shape(as_array(self.P))[0], np.shape(as_array(self.G))[0], self.dimension
         if not p:
             fail("F, S", "are both None, or have no columns", "Give what depends on parameters")
         shapes = {
@@ -149,7 +149,7 @@ class ParametricQP:
 
 def in_numpy(qp: ParametricQP) -> ProgramArrays:
     """Return all fields of a program as arrays of float64, zeros for None."""
-    nz, p, r = np.shape(qp.P)[0], qp.dimension, np.shape(qp.G)[0]
+    nz, p, r = np.shape(as_array(qp.P))[0], qp.dimension, np.shape(as_array(qp.G))[0]
 
     def filled(name: str, *shape: int) -> np.ndarray:
         value = getattr(qp, name)
@@ -192,7 +192,7 @@ def parametric_qp(
         fail("mpc.soft", "has rows, and slacks make another QP", "Make the rows hard first")
     n, m = mpc.system.n, mpc.system.m
     given = [v for v in (reference, input_reference) if v is not None]
-    k = np.shape(given[0])[1] if given and np.ndim(given[0]) == 2 else 0
+    k = np.shape(as_array(given[0]))[1] if given and np.ndim(as_array(given[0])) == 2 else 0
     of_states = np.zeros((n, k)) if reference is None else host_array("reference", reference)
     of_inputs = np.zeros((m, k))
     if input_reference is not None:

@@ -97,7 +97,7 @@ class PolicyProblem(FeasibilityProblem):
         if hard.rate_limited:
             fail("input_rate_limit", f"given with policy {hard.policy!r}", cure)
         inputs = hard.inputs
-        if not isinstance(inputs, Box) or not np.isfinite([inputs.lower, inputs.upper]).all():
+        if not isinstance(inputs, Box) or not np.isfinite(inputs.bounds()).all():
             fail("inputs", "are in no bounded Box, which proofs of this policy need", "Give one")
         view = make_view(hard, axes, fixed)
         if view.projects:
@@ -227,7 +227,8 @@ def tube_fractions(mpc: MPC, view: Any) -> PolicyRows:
         lower.append(None if low is None else low + moved - middle + half)
         upper.append(None if high is None else high + moved - middle - half)
     one = [Fraction(1)] * count
-    limits = np.hstack([zeros(count, N * m), np.diag(np.array(one, object))]) if count else G[:0]
+    ones = np.array(one, object)
+    limits = np.hstack([zeros(count, N * m), np.diag(ones)]) if count else G[:0]
     first = np.hstack([nominal.first[0], gain @ np.asarray(section.generators, float)])
     return PolicyRows(
         F=np.vstack([nominal.F, zeros(count, nominal.F.shape[1])]),
@@ -235,8 +236,8 @@ def tube_fractions(mpc: MPC, view: Any) -> PolicyRows:
         D=zeros(len(G) + count, 0),
         lower=[*lower, *(-v for v in one)],
         upper=[*upper, *one],
-        low=np.append(nominal.low, [-v for v in one]),
-        high=np.append(nominal.high, one),
+        low=np.append(nominal.low, -ones),
+        high=np.append(nominal.high, ones),
         first=(first, gain @ np.asarray(section.center, float)),
     )
 

@@ -116,11 +116,11 @@ def vertex_signs(S: np.ndarray, argument: str = "Zonotope") -> np.ndarray:
             np.put_along_axis(filled, inside, np.array([corner], np.int8), axis=1)
             found.append(filled)
     for row, normal in zip(np.flatnonzero(~plain), normals[~plain], strict=True):
-        inside = np.flatnonzero(on[row])
+        within = np.flatnonzero(on[row])
         _, _, Vt = np.linalg.svd(normal[None])
-        corners = vertex_signs(Vt[1:] @ S[:, inside], argument)
+        corners = vertex_signs(Vt[1:] @ S[:, within], argument)
         filled = np.tile(signs[row], (len(corners), 1))
-        filled[:, inside] = corners
+        filled[:, within] = corners
         found.append(filled)
     half = np.vstack(found)
     return np.unique(np.vstack([half, -half]), axis=0)

@@ -393,7 +393,7 @@ class Polytope(LinearSet):
             inner = self._onto(M[own])
             h = np.asarray(inner.h)
             H = np.zeros((len(h), k))
-            H[:, own] = inner.H
+            H[:, own] = np.asarray(inner.H)
         E = np.zeros((len(others), k))
         E[np.arange(len(others)), others] = 1.0
         E[:, own] = -C

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxmpc.arrays import Reals, host_array
+from jaxmpc.arrays import Reals, as_array, host_array
 from jaxmpc.checks import fail, number, require_finite, require_kind, require_shape, whole
 from jaxmpc.pytrees import pytree, static
 from jaxmpc.sets.convex_sets import AnyNumber, Box, ConvexSet, Polytope, Zonotope
@@ -61,7 +61,7 @@ class MinimalInvariantSet(ConvexSet):
     @property
     def dimension(self) -> int:
         """Return n, the number of coordinates."""
-        return np.shape(self.closed)[0]
+        return np.shape(as_array(self.closed))[0]
 
     def validate(self, argument: str, dimension: int | None = None) -> None:
         """Raise ValueError, naming `argument`, for another number of coordinates."""

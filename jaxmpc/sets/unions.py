@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxmpc.arrays import Reals
+from jaxmpc.arrays import Reals, as_array
 from jaxmpc.checks import fail
 from jaxmpc.pytrees import record
 from jaxmpc.sets import drawing
@@ -32,7 +32,7 @@ class PolytopeUnion:
     def contains(self, x: Reals, tolerance: float = 0.0) -> AnyTruth:
         """Return whether a piece holds a point x (n,), or each of many (k, n)."""
         if not self.pieces:
-            return np.zeros(np.shape(x)[:-1], bool)
+            return np.zeros(np.shape(as_array(x))[:-1], bool)
         return np.any([piece.contains(x, tolerance) for piece in self.pieces], axis=0)
 
     def volume(self) -> float:
