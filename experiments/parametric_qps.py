@@ -117,7 +117,7 @@ def main() -> None:
         solve_there(given.solve)
         return
     from jaxmpc.explicit import critical_regions
-    from jaxmpc.explicit.parametric_qp import in_numpy
+    from jaxmpc.explicit.parametric_program import in_numpy
 
     print("| program | jaxmpc: regions, complete, CPU time, optimum at | PPOPT |\n|---|---|---|")
     for name, (qp, box) in programs().items():

@@ -9,7 +9,7 @@ Law                  plans, and the affine law on the region of a given state ->
 
 from jaxmpc.explicit.exact_penalties import exact_penalty
 from jaxmpc.explicit.law_at_states import Law
-from jaxmpc.explicit.parametric_qp import ParametricQP, parametric_qp
+from jaxmpc.explicit.parametric_program import ParametricQP, parametric_qp
 from jaxmpc.explicit.regions import critical_regions
 
 __all__ = [

@@ -24,7 +24,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from jaxmpc.checks import fail
-from jaxmpc.explicit.parametric_qp import (
+from jaxmpc.explicit.parametric_program import (
     Output,
     ParametricQP,
     Quadratic,

@@ -19,7 +19,7 @@ from jaxmpc.explicit.active_sets import (
     far_vertices,
     least_distance_form,
 )
-from jaxmpc.explicit.parametric_qp import ParametricQP
+from jaxmpc.explicit.parametric_program import ParametricQP
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import record
 from jaxmpc.sets.convex_sets import Box, Polytope

@@ -13,7 +13,7 @@ import pytest
 
 import jaxmpc as jm
 from jaxmpc.explicit import ParametricQP, critical_regions, parametric_qp
-from jaxmpc.explicit.parametric_qp import in_numpy
+from jaxmpc.explicit.parametric_program import in_numpy
 from jaxmpc.mpc.condense import condensed_in_float64
 
 INTEGRATOR = jm.LinearSystem([[1, 1], [0, 1.0]], [0.5, 1])

@@ -11,7 +11,7 @@ from jaxmpc.app.plots.maps import finish, new_axes
 from jaxmpc.app.plots.style import EDGE
 from jaxmpc.arrays import Reals, host_array
 from jaxmpc.checks import fail, require_finite, require_kind, require_shape
-from jaxmpc.explicit.parametric_qp import ParametricQP
+from jaxmpc.explicit.parametric_program import ParametricQP
 from jaxmpc.explicit.regions import CriticalRegions
 from jaxmpc.sets.convex_sets import Polytope
 
