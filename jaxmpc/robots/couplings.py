@@ -33,18 +33,17 @@ class Couplings:
         """Return the projector (nv, nv) onto the velocities that keep the couplings at q."""
         return projector(self.rows(q)[1])
 
-    def met(self, q: np.ndarray) -> tuple[np.ndarray, float]:
-        """Return the configuration near q that meets the couplings, and the largest residual that
-        is left where Newton's method finds none."""
-        q, left = np.array(q, float), 0.0
+    def met(self, q: np.ndarray) -> np.ndarray:
+        """Return the configuration near q that meets the couplings, by Newton's method; where that
+        finds none, where it ends."""
+        q = np.array(q, float)
         for _ in range(_STEPS if self.there else 0):
             residual, G = self.rows(q)
-            left = float(np.abs(residual).max(initial=0.0))
-            if left <= _MET:
+            if np.abs(residual).max(initial=0.0) <= _MET:
                 break
             step = -np.linalg.lstsq(G, residual, rcond=_RANK)[0]
             mujoco.mj_integratePos(self.model, q, step, 1.0)
-        return q, left
+        return q
 
     def kept(self, states: np.ndarray) -> np.ndarray:
         """Return states (..., nq + nv + na) with the nearest configurations and velocities that
@@ -52,7 +51,7 @@ class Couplings:
         states = np.array(states, float)
         nq, nv = self.model.nq, self.model.nv
         for state in states.reshape(-1, states.shape[-1]) if self.there else ():
-            state[:nq], _ = self.met(state[:nq])
+            state[:nq] = self.met(state[:nq])
             velocity = slice(nq, nq + nv)
             state[velocity] = self.motions(state[:nq]) @ state[velocity]
         return states

@@ -163,7 +163,7 @@ def rest_at(robot: RobotDescription, q: np.ndarray, *, within: bool = False) -> 
     """Return the robot at rest in q (nq,) under the drive that comes nearest to a balance: the
     least one of all inputs, or one within the limits."""
     forces = Forces(robot)
-    q, _ = forces.couplings.met(q)
+    q = forces.couplings.met(q)
     J, f = forces.affine(q)
     drive = np.linalg.lstsq(J, -f, rcond=None)[0]
     if within and np.any((drive < forces.lower) | (drive > forces.upper)):

@@ -182,7 +182,7 @@ class Robot(RobotDescription):
         for row in q.reshape(-1, q.shape[-1]) if couplings.there else ():
             beyond = np.abs(couplings.rows(row)[0]).max()
             if beyond > 1e-6:
-                nearest = couplings.met(row)[0]
+                nearest = couplings.met(row)
                 problem = f"{row} violates couplings (equalities) of the file by {beyond:.3g}"
                 fail("q", problem, f"The nearest configuration that meets them: {nearest}")
 

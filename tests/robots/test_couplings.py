@@ -59,7 +59,7 @@ def test_linear_models_have_the_couplings(kind):
     """A and B of a physics step are the C engine's, away from rest, and the plan's model moves the
     coupled joint with the one that is driven."""
     robot = coupled(kind)
-    q, _ = Couplings(robot.predictor.model).met([0.3, -0.2, 0.1])
+    q = Couplings(robot.predictor.model).met([0.3, -0.2, 0.1])
     x, u = np.concatenate([q, [0.5, -0.3, 0.2]]), np.array([1.0, -0.5])
     with jax.enable_x64(True):
         found = robot.transition(x, u)
@@ -87,7 +87,7 @@ def test_a_target_off_the_couplings_is_refused_and_its_cure_helps():
     with pytest.raises(ValueError, match="q: .* violates couplings .* by 0.2") as refusal:
         robot.equilibrium([0.0, 0.0, 0.2])
     cure = np.fromstring(str(refusal.value).split("[")[-1].strip("]. "), sep=" ")
-    x, _ = robot.equilibrium(Couplings(robot.predictor.model).met(cure)[0])
+    x, _ = robot.equilibrium(Couplings(robot.predictor.model).met(cure))
     np.testing.assert_allclose(x[:3], cure, atol=1e-2)
 
 
