@@ -156,8 +156,11 @@ class Disturbance:
 
 @named_pytree
 class Belief(NamedTuple):
-    """An estimate of ξ and disturbances (n + k,), and the covariance (n + k, n + k) of its error;
-    None with a constant gain."""
+    """What a filter knows of ξ and the disturbances.
+
+    mean (n + k,): their estimate. covariance (n + k, n + k): of its error, None with a constant
+    gain.
+    """
 
     mean: Array
     covariance: Array | None

@@ -87,7 +87,10 @@ def first_row(reference: Reals, dtype: Any) -> Array:
 
 @named_pytree
 class NoPlan(NamedTuple):
-    """The plan of a law without plans: cost NaN, status NOT_RUN, no slack."""
+    """The plan of a law without plans.
+
+    cost: NaN. status: NOT_RUN. slack: none, (N+1, 0).
+    """
 
     cost: Array
     status: Array

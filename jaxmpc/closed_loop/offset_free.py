@@ -208,6 +208,8 @@ def augmented(mpc: MPC, observer: KalmanFilter) -> MPC:
     """Return the problem whose states are (x, d), the disturbances of an observer as states that
     stay: for feasible sets with d as a parameter, and for exported controllers.
 
+    observer: a `KalmanFilter` with disturbances d.
+
     Limits, weights and the terminal set are those of x; d is free and costs nothing. Then
         jm.map_feasible_set(augmented(mpc, observer), x0s, axes=range(n), fixed=[0] * n + d)
     maps the states from which the limits can be kept under d, and of `jm.export` the programs take

@@ -47,17 +47,19 @@ class Run:
     """A closed loop of T time steps: x_{t+1} = plant(x_t, u_t) + w_t, u_t the first input of a plan
     (with a delay, of the plan one time step earlier).
 
-    states (T+1, n), inputs (T, m). Of each plan: cost (T,), the optimal value V_N(x_t) (without
-    ½), and status (T,). stage_cost (T,): (x_t − r_t)'Q(x_t − r_t) + (u_t − s_t)'R(u_t − s_t) with
+    states (T+1, n): of the plant; of robots these are (qpos, qvel), and x in costs and limits means
+    their coordinates. inputs (T, m): those that acted.
+    cost (T,): the optimal value V_N(x_t) of each plan (without ½). status (T,): of each plan.
+    stage_cost (T,): (x_t − r_t)'Q(x_t − r_t) + (u_t − s_t)'R(u_t − s_t) with
     the references r, s, zero for none. violation (T+1,): the most by which x_t exceeds a row of
     the state limits, in the units of the row; 0 where it keeps them all. slack (T, p): violations
     of the soft rows at k = 0 of each plan, hence of what happens. fallback (T,): whether the plan
     violates soft rows anywhere on its horizon by more than 1e-6 (1e-3 in float32), as happens
     where the limits cannot all be kept. estimates (T, n): the states as an observer estimates them
-    from the outputs so far, and disturbances (T, k), where it estimates them; None without an
-    observer. Batches have their axes in front. For robots
-    states are the plant's, (qpos, qvel), and x in costs and limits means their
-    coordinates.
+    from the outputs so far; None without an observer. disturbances (T, k): likewise, where it
+    estimates them.
+
+    Batches have their axes in front.
     """
 
     states: Array
@@ -90,6 +92,8 @@ class Run:
 
 def lyapunov_decrease(run: Run) -> Array:
     """Return V_N(x_{t+1}) − V_N(x_t) + l(x_t, u_t) along the loop, (T−1,), l the stage cost.
+
+    run: of `simulate`, or with a batch axis in front.
 
     It is nowhere positive where the optimal value is a Lyapunov function: for the nominal plant,
     inputs free at each step, no weights on input rates or of single stages (the stage cost here

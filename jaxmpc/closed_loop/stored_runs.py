@@ -33,8 +33,11 @@ STORED = tuple(
 
 @record
 class StoredRuns:
-    """What `simulate_into` returns: the runs (B, ...) in NumPy arrays, the settings in the store,
-    and the work of this call."""
+    """What `simulate_into` returns.
+
+    run: the runs, NumPy arrays (B, ...). settings: those in the store. timing: the work of this
+    call.
+    """
 
     run: Run
     settings: Mapping[str, Any]

@@ -42,13 +42,13 @@ SOFTENED = ("state", "output", "terminal")
 class ExactPenalty:
     """The least ρ for which the penalty ρ·Σ slack is exact (see `exact_penalty`).
 
-    rho_bar: sup over X_N of the threshold, or with exact False a lower bound of it, in cost per
-    unit of the rows as given. at (p,): the state where it is approached, row: the soft row that
-    needs it (None where rho_bar is 0), label: that row with bound, step and unit. method:
-    "regions" or "samples". advised: a weight with a margin. thresholds (B,), status (B,): at the
-    given states, NaN and PRIMAL_INFEASIBLE or NON_FINITE where there is none. sufficient:
-    whether the given weight ρ is exact on all of X_N; None where that is not known, or none
-    was given. regions: the critical regions, where they were enumerated. evaluated: number of
+    rho_bar: sup over X_N of the threshold, in cost per unit of the rows as given. at (p,): the
+    state where it is approached. row: the soft row that needs it (None where rho_bar is 0).
+    label: that row with bound, step and unit. method: "regions" or "samples".
+    exact: False where rho_bar is a lower bound. advised: a weight with a margin. thresholds (B,),
+    status (B,): at the given states, NaN and PRIMAL_INFEASIBLE or NON_FINITE where there is none.
+    sufficient: whether the given weight ρ is exact on all of X_N; None where that is not known, or
+    none was given. regions: the critical regions, where they were enumerated. evaluated: number of
     active sets.
     """
 
@@ -114,14 +114,19 @@ def exact_penalty(
     Rows that no input moves (k = 0) are constants and do not count; inputs and rates stay hard.
 
     x0s (B, p) or None: states at which to give the threshold as well; p = mpc.dimension.
-    method: "regions": λ is affine on each critical region and its maximum is at a vertex; exact
-    when the regions are complete. "samples": a lower bound, from `samples` rays to the boundary of
-    X_N and a search across facets from the best regions found (on a region λ is maximised by LPs);
-    it can miss the greatest. "auto": regions up to four states, and samples as well where there are
-    more than `max_regions` of them. Where active rows are dependent the multipliers are not unique,
-    and an LP finds those with the least maximum. rho: a weight to check; None: those of `mpc.soft`,
-    if any. within: the set of initial states, needed where X_N is unbounded. seconds: after which
-    the search stops, and rho_bar is a lower bound.
+    method: "regions", "samples" or "auto"; see below.
+    rho: a weight to check; None: those of `mpc.soft`, if any.
+    max_regions: critical regions to enumerate at most.
+    within: the set of initial states, needed where X_N is unbounded.
+    samples: rays to the boundary of X_N, for the method of this name.
+    seconds: after which the search stops, and rho_bar is a lower bound.
+
+    The method "regions" uses that λ is affine on each critical region and its maximum is at a
+    vertex; it is exact when the regions are complete. "samples" gives a lower bound, from rays to
+    the boundary of X_N and a search across facets from the best regions found (on a region λ is
+    maximised by LPs); it can miss the greatest. "auto" takes regions up to four states, and samples
+    as well where there are too many of them. Where active rows are dependent the multipliers are
+    not unique, and an LP finds those with the least maximum.
 
     Raises ValueError for ill-posed problems, wrong arguments, an ellipsoidal terminal set, no soft
     row, and where X_N is empty, flat or unbounded. NumPy in float64; not traceable.

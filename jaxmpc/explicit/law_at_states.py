@@ -29,7 +29,10 @@ TOUCHING, MATCHING = 1e-7, 1e-6
 
 @record
 class AffinePiece:
-    """x⁺ = E x + e on the region R x ≤ r (unit rows) where one set of rows is active."""
+    """The closed loop x⁺ = E x + e on the region R x ≤ r where one set of rows is active.
+
+    E (n, n), e (n,): of the next state. R (k, n), r (k,): of the region, unit rows.
+    """
 
     E: np.ndarray
     e: np.ndarray

@@ -46,11 +46,14 @@ WINDOWS, ROOM = 8, 8.0
 class Region:
     """One critical region and its affine law, in the p parameters θ, such as the state.
 
-    rows (a,): active rows of `Condensed.C`, or of `ParametricQP.G`. On the region the optimum is
-    z = Z θ + z0 (nz,), its multipliers y = L θ + l0 (a,) for the cost without ½ (y ≥ 0 at an upper
-    bound, y ≤ 0 at a lower one, any sign where both are equal; the last rows are those of
-    equalities that the rows imply, if there are any), the law K θ + k (m,): the first input of an
-    MPC, a prestabilising gain included. The cost is ½ θ'V θ + v'θ + v0.
+    On the region the optimum is z = Z θ + z0, its multipliers are y = L θ + l0 for the cost without
+    ½ (y ≥ 0 at an upper bound, y ≤ 0 at a lower one, any sign where both are equal; the last rows
+    are those of equalities that the rows imply, if there are any), the law is K θ + k: the first
+    input of an MPC, a prestabilising gain included. The cost is ½ θ'V θ + v'θ + v0.
+
+    rows (a,): active rows of `Condensed.C`, or of `ParametricQP.G`.
+    Z (nz, p), z0 (nz,): of the optimum. L (a, p), l0 (a,): of the multipliers.
+    K (m, p), k (m,): of the law. V (p, p), v (p,), v0: of the cost.
     also_active: rows that are active all over the region and depend on `rows`.
     polytope: irredundant unit rows in θ, and where equalities tie the parameters to each other
     these as two rows each. vertices (k, p): of what lies in the window. volume: in the free
@@ -80,13 +83,14 @@ class CriticalRegions:
     Of an MPC problem the parameters are x0, or (x, u_{−1}) where input rates matter, and X_N holds
     those with u_{−1} in the input limits. Else X_N is the set of parameters with a feasible z.
 
+    problem: whose they are. regions: all of them, if complete.
     complete: the regions fill X_N, i.e. the volumes sum to that of the hull of all vertices, and
     no support LP over the rows as given finds a point of X_N beyond a facet of that hull (both to
     1e-9 of its size); and at the vertices of each, hence all over it, the law meets the optimality
     conditions of the program as given, to 1e-6 of their terms. Where X_N is unbounded all this was
-    checked in a window, lower and upper bounds (2, d) of the free parameters, that holds the
-    vertices of all regions in its inner eighth; None else. Regions reach beyond it as their rows
-    say.
+    checked in the window. window (2, d): lower and upper bounds of the free parameters, which
+    hold the vertices of all regions in the inner eighth; None where X_N is bounded. If regions
+    reach beyond it, they do as their rows say.
     free (d,): the indices of the free parameters; where equalities tie the others to these, volumes
     are in these. volume: the sum. reason: what was checked, or what stopped the search.
     """

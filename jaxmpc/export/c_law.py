@@ -110,6 +110,7 @@ def export_explicit_c(
     tree is deep, and those of one region's facets. What it costs is memory, which grows as the
     number of regions. The status says whether the state has a plan at all.
 
+    regions: of `critical_regions`, all of them. name: with which files and C functions begin.
     folder: where NAME.c, NAME.h, NAME_sizes.h, NAME_tables.h and NAME_example.c are written. dtype:
     type of all numbers there. tolerance: distance beyond a facet that counts as inside, relative to
     the size of the feasible set, None: 1e-9, and 1e-5 in float32.

@@ -190,7 +190,10 @@ def check_fixed_steps(
     """Run `Controller(mpc, solver)` with newton_steps=0 from random states of the box [lower,
     upper] (n,), and at each state solve the plan precisely too.
 
-    20 closed loops begin at states that have a plan; `plans` is rounded up to a multiple of 20.
+    20 closed loops begin at states that have a plan.
+
+    lower, upper: corners (n,) of the box. plans: how many, rounded up to a multiple of 20.
+    tolerance: as in `export_c`.
 
     Raises ValueError for an invalid problem, bounds of another shape than (n,) and bad counts.
     """

@@ -41,8 +41,9 @@ BOUNDS = {
 class FeasibleSetMap:
     """Points of a state space, each with its label and the proof of it (see `Labels`).
 
-    x0s (B, d): the points, in the states `axes`. bound_point (K, d), bound_normal (F, d),
-    bound_offset (F,): points proved feasible and half-spaces proved valid by `refine`.
+    problem: what was asked. x0s (B, d): the points, in the states `axes`. labels: of the points,
+    with their proofs. bound_point (K, d): points that `refine` proved feasible. bound_normal
+    (F, d), bound_offset (F,): half-spaces a'x ≤ b that `refine` proved valid.
     """
 
     problem: FeasibilityProblem
@@ -308,7 +309,17 @@ def map_feasible_set(
 
     x0s: points (B, d). axes: indices or names of the d mapped states (None: all n). fixed: values
     (n,) of all states, for a slice through them; None with d < n: a projection (feasible if some
-    value of the other states is). The cost is ignored. Every label rests on a proof in float64
+    value of the other states is).
+    iterations, dtype: of the ADMM stage alone; they cannot make a label wrong.
+    chunk: number of points that a compiled program takes at once (None: by device).
+    gap: call `FeasibleSetMap.refine` with this gap, None to skip it. progress: show a bar.
+    executor: what labels the chunks, such as a `concurrent.futures.ProcessPoolExecutor` with the
+    start method spawn, or the executor of a cluster: `submit(function, *arguments)` returns a
+    future with `result()`; None: this process.
+    devices: a number of them, or a sequence of JAX devices, which share the points of a chunk;
+    None: the default device.
+
+    The cost is ignored. Every label rests on a proof in float64
     (`proofs.py`): an input sequence whose roll-out keeps all rows, or a half-space that excludes
     the point, each by more than rounding; what is neither is 0, undecided. Where equalities tie the
     inputs to the states (a terminal point) the proof is that inputs within rounding of the plan
@@ -317,16 +328,10 @@ def map_feasible_set(
     limits exclude, which cannot have been applied, is labelled −1. Of a robust problem a label is
     about its policy: 1 that one keeps all rows under every disturbance, −1 that none of its kind
     does; affine ones are combined from those at the ends of rays (`policy_hull.py`), for up to four
-    states. iterations and dtype affect the
-    ADMM stage alone and cannot make a label wrong. The last undecided points, up to 2,000 in a
-    call, get linear programs of some milliseconds each, an equal share of each chunk. chunk: number
-    of points that a compiled program takes at once (None: by device). gap: call
-    `FeasibleSetMap.refine` with this gap, None to skip it. progress: show a bar. executor: what
-    labels the chunks, such as a `concurrent.futures.ProcessPoolExecutor` with the start method
-    spawn, or the executor of a cluster: `submit(function, *arguments)` returns a future with
-    `result()`. Labels and proofs are those without it, bit for bit on processors of one kind. A
-    chunk whose worker died is submitted again up to 3 times, with a warning. devices: a number of
-    them, or a sequence of JAX devices, which share the points of a chunk; None: the default device.
+    states. The last undecided points, up to 2,000 in a call, get linear programs of some
+    milliseconds each, an equal share of each chunk. Labels and proofs are the same with an executor
+    and without, bit for bit on processors of one kind; a chunk whose worker died is submitted again
+    up to 3 times, with a warning.
 
     A point with NaN or infinity gets status NON_FINITE and label 0. Raises ValueError for wrong
     shapes and ill-posed problems before anything compiles. `sweep` labels a grid into a store.

@@ -75,7 +75,11 @@ def any_policy_polytope(mpc: MPC) -> Polytope:
 
 @record
 class Growth:
-    """Feasible sets at several horizons: horizons (H,), volume (H,), facets (H,), and the sets."""
+    """Feasible sets at several horizons.
+
+    horizons (H,): which. volume (H,), facets (H,): of each set, the volume and the number of
+    facets. sets: the polytopes.
+    """
 
     horizons: np.ndarray
     volume: np.ndarray
@@ -85,6 +89,8 @@ class Growth:
 
 def feasible_growth(mpc: MPC, horizons: Sequence[int]) -> Growth:
     """Compute how X_N grows or shrinks with N: `feasible_polytope` at each of `horizons`.
+
+    horizons: whole numbers N ≥ 1, in place of that of `mpc`.
 
     Raises ValueError as `feasible_polytope` does, and where steps or blocks of `mpc` fit one
     horizon only.

@@ -58,13 +58,14 @@ class ProvedBounds(NamedTuple):
 
 @record
 class Boundary:
-    """Rays from `center` (d,) along `directions` (K, d), and what was proved on each.
+    """Rays from a point of the feasible set, and what was proved on each.
 
+    center (d,): where they begin. directions (K, d): where they go.
     inner (K,): largest t for which centre + t d was proved feasible (NaN: none). outer (K,):
-    where the ray leaves all the half-spaces (inf: never). points (K, d): the points at `inner`,
+    where the ray leaves all the half-spaces (inf: never). points (K, d): the points at `inner`.
     w (K, k): with which the constraint rows hold there.
     normals (K, d), offsets (K,): half-spaces a'x ≤ b that hold on the whole feasible set
-    (b = inf where the LP gave none), and cuts, the `proofs.Cut` they follow from.
+    (b = inf where the LP gave none). cuts: the `proofs.Cut` they follow from.
     """
 
     center: np.ndarray

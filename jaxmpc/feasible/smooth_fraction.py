@@ -39,6 +39,11 @@ def feasible_fraction(
 ) -> Array:
     """Return the smoothed fraction of states x0s (B, n) from which hard constraints can be kept.
 
+    width: of the smoothing, > 0, as a fraction of each limit's size.
+    scale: these sizes (rows,), in the order of `row_table`; None: half the distance of the two
+        sides of a limit, the absolute value of an only side.
+    newton_steps: of the search for the plan nearest to the limits.
+
     The mean of `membership`. Times the volume of the region that x0s samples evenly it is the
     volume of the feasible set, but for the smoothing. Differentiable with respect to every array
     of `mpc` and x0s, in both modes, once.

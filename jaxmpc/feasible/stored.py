@@ -56,7 +56,11 @@ FAR = 100.0
 
 
 class Picture(NamedTuple):
-    """Labels (b,) on points (b, 2), evenly spaced lines of a grid, and the counts on all of it."""
+    """What a picture of a map shows.
+
+    points (b, 2): where evenly spaced lines of the grid cross. label (b,): theirs. counts: of all
+    points of the grid.
+    """
 
     points: np.ndarray
     label: np.ndarray

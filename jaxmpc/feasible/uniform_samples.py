@@ -67,7 +67,7 @@ class FeasibleSamples:
 
     labels: their proofs, as in `map_feasible_set`; all are feasible, and `labels.plan` are inputs
     that keep all hard constraints. method: "triangulation", whose points are independent, or
-    "hit and run", in `chains` chains with `steps` steps between their points. accepted: the
+    "hit and run". chains: how many of these, 0 for none. steps: between their points. accepted: the
     fraction of the points drawn that lie in X_N. half_spaces: how many the chains run in. seconds:
     from the call on.
     """

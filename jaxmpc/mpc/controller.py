@@ -76,6 +76,8 @@ class Controller:
     finite plan. A plan is a warm start only where that is nearer to the solution than none: one bad
     reading, finite or not, is forgotten with the next time step.
 
+    mpc: the problem. solver: its settings.
+
     `condensed` and `factor` are filled in at construction, which `dataclasses.replace` repeats and
     JAX, which rebuilds pytrees, does not. Each array has a buffer of its own: a controller may be
     donated.
@@ -437,6 +439,8 @@ def solve(
 ) -> Plan:
     """Solve one MPC problem from the state x0 (n,).
 
+    mpc: the problem. x0 (n,): the initial state, in the units of x.
+    solver: settings of the solver.
     reference: state to track, (n,) or (N+1, n), in place of the origin: the cost becomes
     Σ (x_k − r_k)'Q(x_k − r_k) + …; constraints, the terminal set too, stay where they are.
     input_reference: input to track, (m,) or (N, m), such as that of `equilibrium`; None for zero.

@@ -30,6 +30,7 @@ def first_step_in(
 
     Arguments:
         mpc: a nominal problem, without a terminal set, which could be out of reach.
+        invariant: the set that x_1 lies in: Box or Polytope in R^n.
         systems: the vertices (A_i, B_i, c_i) of the hull that the plant stays in; none: mpc.system.
         disturbance: bounded set in R^p that holds the origin, or None for w = 0.
         disturbance_matrix: E (n, p), None for the identity.

@@ -117,9 +117,13 @@ class Multipliers:
     """Lagrange multipliers of a plan, for the cost without ½: y > 0 where the upper bound of the
     row is active, y < 0 where the lower is.
 
-    states (K, r): rows of `states` at the steps where they hold, inputs (N, m or rows), terminal
-    (r_f,) (for an Ellipsoid {x'Px ≤ level}: of the rows L'x with P = LL', n of them). outputs and
-    soft and tasks with limits: one array (steps, rows) for each of the problem's; rates (N, m).
+    states (K, r): of the rows of `states` at the steps where they hold.
+    inputs (N, m or rows): of the input limits.
+    terminal (r_f,): of the terminal set (for an Ellipsoid {x'Px ≤ level}: of the rows L'x with
+    P = LL', n of them).
+    outputs, soft, tasks: one array (steps, rows) for each of the problem's.
+    rates (N, m): of the limits of input rates.
+
     dJ*/d(upper bound) = −y where y > 0, dJ*/d(lower bound) = −y where y < 0.
     `active_constraints` lists them by name, step and unit.
     """
@@ -135,15 +139,20 @@ class Multipliers:
 
 @pytree
 class Plan(WithStatus):
-    """Answer of `solve`: states (N+1, n), inputs (N, m), cost J (without ½), multipliers, status.
+    """Answer of `solve`.
 
-    cost includes what soft rows and input rates pay. slack (N+1, p): violation of the p soft rows,
-    in the order of `mpc.soft`, zero at steps where a row does not hold.
+    states (N+1, n): x_0 … x_N. inputs (N, m): u_0 … u_{N−1}.
+    cost: J (without ½), with what soft rows and input rates pay.
+    slack (N+1, p): violation of the p soft rows, in the order of `mpc.soft`, zero at steps where a
+    row does not hold.
+    multipliers: of the rows, see `Multipliers`.
+    status: `jaxmpc.Status`, that of the QP.
+    primal_residual, dual_residual, gap: of the condensed QP, in the units of states and inputs.
+    iterations: ADMM steps, of `solve_nonlinear` quadratic programs.
+
     Unless the status is SOLVED, cost and trajectory are those of the best iterate and mean little:
     from a state without a feasible plan the inputs too may lie outside their limits. The first one
     clipped into them is what `Controller(mpc)(x)` gives.
-    The status is that of the QP (`jaxmpc.Status`); residuals are those of the condensed QP in
-    the units of states and inputs. iterations: ADMM steps, of `solve_nonlinear` quadratic programs.
     A plan serves as warm start.
     """
 
@@ -420,7 +429,10 @@ def active_constraints(
 ) -> tuple[ActiveConstraint, ...]:
     """The limits with a multiplier above `tolerance`, largest first.
 
-    plan: of `mpc`, one instance. The multiplier of a bound is the sensitivity of the optimal cost:
+    plan: of `mpc`, one instance. tolerance: in cost per unit of a
+    row.
+
+    The multiplier of a bound is the sensitivity of the optimal cost:
     dJ*/d(bound) = −multiplier for an upper bound, +multiplier for a lower one. Where rows coincide
     (inputs of one block of a control horizon, states at N beside the terminal set) they share it in
     an arbitrary way: only their sum is a sensitivity, of relaxing all of them. NumPy; not

@@ -59,9 +59,14 @@ class TwoSided:
 class Outputs(TwoSided):
     """Hard limits of outputs, lower ≤ C x_k + D u_k ≤ upper.
 
-    C (p, n), lower and upper (p,), None where all rows lack that side (in single rows −inf, inf),
-    D (p, m) or None. stages: the k at which they hold; None: those of the state limits, and where
-    the state limits hold at k = N, without D there too. names, units: of the p outputs.
+    Arguments:
+        C: (p, n), one row an output.
+        lower, upper: (p,), in the units of the outputs; None where all rows lack that side, −inf
+            and inf where single rows do.
+        D: (p, m), or None for zero.
+        stages: the k at which they hold; None: those of the state limits, and where the state
+            limits hold at k = N, without D there too.
+        names, units: of the p outputs, for tables and pictures; () for none.
     """
 
     C: Reals
@@ -83,8 +88,12 @@ class Soft(TwoSided):
         lower − ε_k ≤ C x_k + D u_k ≤ upper + ε_k,  ε_k ≥ 0,   cost + ρ Σ ε_k + quadratic Σ ε_k²
         (no ½).
 
-    rho ρ ≥ 0 and quadratic ≥ 0: numbers or (p,). stages None: k = 0..N, with D k = 0..N−1. All else
-    as in `Outputs`.
+    Arguments:
+        C, D, lower, upper, names, units: as in `Outputs`.
+        rho: ρ ≥ 0, in cost per unit of the row; a number or (p,).
+        quadratic: ≥ 0, in cost per squared unit; a number or (p,).
+        stages: the k at which they hold; None: k = 0..N, with D k = 0..N−1.
+
     For ρ above the greatest multiplier of the hard rows (`exact_penalty`) the plan violates them
     only where the hard problem has no solution.
     """
@@ -145,40 +154,51 @@ class MPC:
              x_k ∈ states (k = 0..N−1; from 1 if constrain_initial is False),
              u_k ∈ inputs (k = 0..N−1),  x_N ∈ terminal_set.
 
-    system: LinearSystem. Q (n, n) ⪰ 0, R (m, m) ⪰ 0, terminal_cost P (n, n) ⪰ 0 or None (no
-    terminal cost); a vector is a diagonal, and a number will do for one state or input. Weights are
-    symmetric; of one that is traced by JAX the symmetric part counts, in derivatives too. R need
-    not be definite where Q, P or input_rate_weight give u_0, the input that is applied, a cost: it
-    is unique then. Later ones may have none, as the last has without an end cost; solvers stage by
-    stage and explicit laws need a cost of each. states, inputs: Box, Polytope or None;
-    terminal_set: these or an Ellipsoid.
-    constrained_stages: the k in 0..N at which `states` hold, where that is another index set.
-    outputs: `Outputs`, or a tuple of them; soft: `Soft`, or a tuple of them. stage_weights s (N,) >
-    0: weighs the stages, Σ s_k (x_k'Q x_k + u_k'R u_k); None: all 1.
+    Arguments:
+        system: LinearSystem with n states and m inputs.
+        Q: (n, n) ⪰ 0, or its diagonal (n,), or a number for one state.
+        R: (m, m) ⪰ 0, or its diagonal (m,), or a number for one input.
+        horizon: N ≥ 1.
+        states: Box or Polytope in the units of x; None: no limits.
+        inputs: Box or Polytope in the units of u; None: no limits.
+        terminal_cost: P (n, n) ⪰ 0 or its diagonal; None: no terminal cost.
+        terminal_set: Box, Polytope or Ellipsoid that holds x_N; None: x_N is free.
+        constrain_initial: whether `states` hold at k = 0, which no input moves.
+        prestabilise: gain K (m, n) of the substitution u = Kx + v, which keeps long predictions of
+            unstable plants well-conditioned; True: the LQR gain; False: none; None: the LQR gain
+            where A has an eigenvalue outside the unit circle. It changes rounding, not the problem;
+            with control_horizon there is none. Inside `jit` with A as an argument give K itself:
+            None and True read values.
+        soft: `Soft`, or a tuple of them.
+        outputs: `Outputs`, or a tuple of them.
+        constrained_stages: the k in 0..N at which `states` hold, where that is another index set.
+        control_horizon: number of free moves m ≤ N, u_k = u_{m−1} from k = m − 1 on, or a tuple of
+            block lengths that add up to N (move blocking).
+        input_rate_weight: W (m, m) or its diagonal (m,), or a number for one input: adds
+            Σ Δu_k'W Δu_k with Δu_k = u_k − u_{k−1}.
+        input_rate_limit: |Δu_k| ≤ limit, (m,) or a number, or Δu_k in a Box; in the units of u for
+            each time step. With it, or a weight of rates, the previous input u_{−1} is part of the
+            state of the controller: `solve(..., previous_input=)`; in sweeps the states are
+            (x, u_{−1}), n + m in all, if there is a limit.
+        stage_weights: s (N,) > 0 weighs the stages, Σ s_k (x_k'Q x_k + u_k'R u_k); None: all 1.
+        disturbance: W, a bounded Box, Polytope or Zonotope that holds the origin: the plant is
+            x⁺ = A x + B u + c + E w, and all rows, the terminal set and soft rows too, are kept for
+            every w_k ∈ W.
+        disturbance_matrix: E (n, p); None: the identity.
+        policy: how later inputs answer to disturbances: "tightened", "affine" or "tube".
+        gain: K (m, n) of the policies, u = Kx; None: the LQR gain of Q and R.
 
-    control_horizon: number of free moves m ≤ N, u_k = u_{m−1} from k = m − 1 on, or a tuple of
-    block lengths that add up to N (move blocking). input_rate_weight W: adds Σ Δu_k'W Δu_k,
-    W (m, m) or its diagonal (m,), with Δu_k = u_k − u_{k−1}; input_rate_limit: |Δu_k| ≤ limit,
-    (m,) or a number, or a Box. With either, the previous input u_{−1} is part of the state of the
-    controller: `solve(..., previous_input=)`; in sweeps the states are (x, u_{−1}), n + m in all,
-    if there is a limit.
+    Weights are symmetric; of one that is traced by JAX the symmetric part counts, in derivatives
+    too. R need not be definite where Q, P or input_rate_weight give u_0, the input that is applied,
+    a cost: it is unique then. Later ones may have none, as the last has without an end cost;
+    solvers stage by stage and explicit laws need a cost of each.
 
-    prestabilise: gain K (m, n) of the substitution u = Kx + v, which keeps long predictions of
-    unstable plants well-conditioned; True: the LQR gain; False: none; None: the LQR gain where A
-    has an eigenvalue outside the unit circle. It changes rounding, not the problem; with
-    control_horizon there is none. Inside `jit` with A as an argument give K itself: None and True
-    read values.
-
-    disturbance W: the plant is x⁺ = A x + B u + c + E w, and all rows, the terminal set and soft
-    rows too, are kept for every w_k ∈ W: a bounded Box, Polytope or zonotope that holds the origin.
-    disturbance_matrix E (n, p), None for the identity. policy: how later inputs answer to
-    disturbances. "tightened": u_k = v_k + K (x_k − z_k) with z the nominal states of the plan v and
-    K = gain (m, n), u = Kx; None: the LQR gain of Q and R. Plans, costs and multipliers are those
-    of z and v, whose rows are tightened by what the disturbance can do (`tightening.py`).
-    "affine": u_k = v_k + Σ_{j<k} M_kj w_j, of which these are a part; it has the largest feasible
-    set. "tube": u_k = v_k + K (x_k − z_k) with z_0 anywhere in x_0 − S, S the minimal robust
-    invariant set under K. These two are for maps, boundaries and polytopes of feasible sets. Labels
-    of feasible sets are claims about the policy.
+    The policy "tightened" is u_k = v_k + K (x_k − z_k) with z the nominal states of the plan v.
+    Plans, costs and multipliers are those of z and v, whose rows are tightened by what the
+    disturbance can do (`tightening.py`). "affine": u_k = v_k + Σ_{j<k} M_kj w_j, of which these are
+    a part; it has the largest feasible set. "tube": u_k = v_k + K (x_k − z_k) with z_0 anywhere in
+    x_0 − S, S the minimal robust invariant set under K. These two are for maps, boundaries and
+    polytopes of feasible sets. Labels of feasible sets are claims about the policy.
     """
 
     system: LinearSystem

@@ -271,10 +271,22 @@ class Bounds:
 class QP:
     """Quadratic program: minimise ½ z'Pz + q'z subject to l ≤ Az ≤ u.
 
-    P (n, n) symmetric positive semidefinite, q (n,), A (m, n), l and u (m,). P and A may be
-    SciPy's sparse matrices, which are made dense. Entries of l may
-    be -inf and of u +inf; l = u is an equality. For a batch that shares matrices keep P and
-    A unbatched: `jax.vmap(solve_qp, in_axes=(QP(P=None, q=0, A=None, l=0, u=0),))`.
+    Arguments:
+        P: (n, n), symmetric positive semidefinite; it may be a sparse matrix of SciPy, which is
+            made dense.
+        q: (n,).
+        A: (m, n); as P it may be sparse.
+        l, u: (m,), −inf and inf where there is no bound; l = u is an equality.
+        soft_linear: (m,), weights of violations, inf for a hard row; see below.
+        soft_quadratic: (m,), weights of squared violations; see below.
+        radius: (len(balls),), of each ball; see below.
+        row_sizes: (m,) ≥ 0, what tolerances of rows are relative to, in place of their terms
+            A_ij z_j; 0 or None: to these. Where l and u are differences, such as limits less what
+            the present state contributes, the sizes of the limits belong here.
+        balls: number of rows of each ball; see below.
+
+    For a batch that shares matrices keep P and A unbatched:
+    `jax.vmap(solve_qp, in_axes=(QP(P=None, q=0, A=None, l=0, u=0),))`.
 
     Soft rows: where soft_linear (m,) is finite, row i may be violated by d ≥ 0 at the cost
     soft_linear_i d + ½ soft_quadratic_i d² (an L1 penalty is exact where it exceeds the row's
@@ -284,10 +296,6 @@ class QP:
     Balls: the last sum(balls) rows form blocks of balls[i] rows each, and block i asks
     |A_b z − l_b| ≤ radius_i, with l_b = u_b its centre. An ellipsoid {x: (x − c)'M(x − c) ≤ r²}
     is a ball in the rows L'x, M = LL'.
-
-    row_sizes (m,) ≥ 0: what tolerances of rows are relative to, in place of their terms A_ij z_j; 0
-    or None: to these. Where l and u are differences, such as limits less what the present state
-    contributes, the sizes of the limits belong here.
     """
 
     P: Any
@@ -421,8 +429,10 @@ def dense(M: Any) -> Any:
 
 @named_pytree
 class Duals(NamedTuple):
-    """Multipliers in qpsolvers' form, Px + q + G'z + A'y + z_box = 0: z ≥ 0 of Gx ≤ h, y of
-    Ax = b, z_box (n,) of lb ≤ x ≤ ub, ≥ 0 at the upper bound and ≤ 0 at the lower."""
+    """Multipliers in qpsolvers' form, Px + q + G'z + A'y + z_box = 0.
+
+    z: of Gx ≤ h, z ≥ 0. y: of Ax = b. z_box (n,): of lb ≤ x ≤ ub, ≥ 0 at the upper bound and ≤ 0 at
+    the lower."""
 
     z: Array
     y: Array
@@ -433,11 +443,11 @@ class Duals(NamedTuple):
 class QPSolution(WithStatus):
     """A primal-dual pair and what is known about it.
 
-    z (n,) primal. y (m,) multipliers: Pz + q + A'y = 0, y > 0 where the upper bound is active,
-    y < 0 where the lower is. cost: ½ z'Pz + q'z plus the penalties of soft rows; its derivative is
-    that of the optimal value. Residuals are infinity norms in the problem's own units: of Az less
-    its projection on hard constraints, of Pz + q + A'y, and of the duality gap
-    z'Pz + q'z + g(Az) + g*(y).
+    z (n,): the primal solution. y (m,): multipliers, Pz + q + A'y = 0, y > 0 where the upper bound
+    is active, y < 0 where the lower is. cost: ½ z'Pz + q'z plus the penalties of soft rows; its
+    derivative is that of the optimal value.
+    primal_residual: infinity norm of Az less its projection on the hard constraints, in the
+    problem's own units. dual_residual: that of Pz + q + A'y. gap: z'Pz + q'z + g(Az) + g*(y).
     certificate (m,): for PRIMAL_INFEASIBLE the Farkas vector, else zeros. ray (n,): for
     DUAL_INFEASIBLE a direction of unbounded descent, else zeros. iterations: ADMM steps run.
     `solved` and `sentence` say what the status means.

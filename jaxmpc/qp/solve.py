@@ -77,7 +77,11 @@ def solve_qp(qp: QP, solver: ADMM = DEFAULT, warm_start: WarmPair = None) -> QPS
     One instance; `jax.vmap` for many. Where P and A are not batched they are factored once;
     where they are, each instance has its own factor. Soft rows and balls: see `QP`. Bounds of 1e20
     and above are infinite.
-    warm_start: a (z, y) pair or an earlier QPSolution. The status comes from residuals in the
+
+    qp: the program. solver: settings of the solver.
+    warm_start: a (z, y) pair or an earlier QPSolution.
+
+    The status comes from residuals in the
     units of `qp` (see `ADMM.eps`), computed in float64 even for float32 data, or from a
     certificate (`residuals.py`); of float32 data it speaks of the float64 pair that was found,
     which is then rounded. z, y and cost are differentiable with respect to every array
@@ -354,7 +358,10 @@ def feasibility_margin(
     of the feasible set. An equality keeps t ≤ 0. The cost P, q and soft rows do not count; t
     stops at `max_margin`, which one-sided rows alone may never do.
 
-    scale (m,) > 0: what a violation of 1 means in each row; None: 1, the row's own unit. t is
+    qp: the program. max_margin: the largest t of interest.
+    scale (m,) > 0: what a violation of 1 means in each row; None: 1, the row's own unit.
+
+    The margin t is
     the value of a linear program, concave in l and u and therefore, in MPC, in the initial
     state; differentiable (the gradient is one of its supergradients) whatever its sign. The
     status is that of the linear program: t is exact where it is SOLVED. One instance;

@@ -297,6 +297,7 @@ def smallest_horizon(
 ) -> SmallestHorizon:
     """Try horizons 1, 2, … up to `max_horizon` with proofs alone (no samples, no search).
 
+    max_horizon: the largest to try. max_regions: critical regions to enumerate at most.
     seconds: time limit, after which larger horizons are left out (some linear programs are
     finished); a horizon takes a second or so with two states, minutes with hundreds of facets or
     thousands of regions. progress: print each horizon on stderr. The horizon of `mpc` itself has

@@ -41,11 +41,12 @@ FOLLOWED, ROUNDS, NEIGHBOURS, NEAR = 6, 10, 4, 1e-4
 class Counterexample:
     """A feasible state whose optimal first input leads to an infeasible one.
 
-    state x (p,) is feasible by proof: `feasible_inputs` (N, m) keep all rows in a float64 roll-out
-    with margins above rounding. inputs (N, m): the optimal plan, to the given residuals.
-    next_state: A x + B u_0 + c. The half-space normal'x ≤ offset holds on the whole feasible set,
-    by proof, and excludes next_state by `distance` = (normal'x⁺ − offset)/|normal|. found:
-    "search", "sample" or "regions". Where input rates are limited, states are (x, u_{−1}).
+    state x (p,): feasible by proof. Where input rates are limited, states are (x, u_{−1}).
+    feasible_inputs (N, m): these keep all rows from there in a float64 roll-out, with margins above
+    rounding. inputs (N, m): the optimal plan, to the given residuals.
+    next_state (p,): A x + B u_0 + c. normal (p,), offset: the half-space normal'x ≤ offset holds on
+    the whole feasible set, by proof. distance: (normal'x⁺ − offset)/|normal|, by which that
+    excludes the next state. found: "search", "sample" or "regions".
     """
 
     state: np.ndarray

@@ -33,8 +33,9 @@ LATE = "the time was over before its linear programs were solved"
 
 @record
 class Claim:
-    """A claim: holds True (proved), False (refuted) or None (open); and why.
+    """A claim, whether it holds, and why.
 
+    holds: True (proved), False (refuted) or None (open). reason: in words.
     state (p,): where it is refuted, the state of the counterexample; else None.
     """
 

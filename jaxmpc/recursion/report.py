@@ -22,11 +22,15 @@ FILES = ("summary.json", "recursion.npz", "recursion.png")
 class RecursionReport:
     """What is known about the recursive feasibility of one MPC problem.
 
+    strong: the claim that every feasible first input leads back into X_N. law: that the optimal
+    one does. weak: that some one does.
     counterexample: the worst one to the law that was found, or None. feasible_set: X_N (half-spaces
-    valid and vertices reached, to 1e-9 of its size), None where facets were not enumerated. volume:
-    of X_N; lost_by_any: of the part from which every first input leaves X_N; lost_by_law: of the
-    part from which the optimal one does, from critical regions. NaN where not computed. loops: from
-    the sample states, none where the law is proved and no states were given, or without time.
+    valid and vertices reached, to 1e-9 of its size), None where facets were not enumerated.
+    volume: of X_N, NaN where not computed, as in the next two.
+    lost_by_any: volume of the part from which every first input leaves X_N. lost_by_law: of that
+    from which the optimal one does, from critical regions.
+    loops: from the sample states, none where the law is proved and no states were given, or without
+    time.
     """
 
     mpc: MPC
@@ -92,8 +96,9 @@ class RecursionReport:
 class SmallestHorizon:
     """The least horizon at which the law is proved recursively feasible, None where none was found.
 
-    strong: the least at which every feasible first input is proved to stay (None: none). reasons:
-    the claim about the law at each horizon looked at, up to max_horizon.
+    horizon: that one. strong: the least at which every feasible first input is proved to stay
+    (None: none). reasons: the claim about the law at each horizon looked at. max_horizon: the
+    largest of these.
     """
 
     horizon: int | None
@@ -117,8 +122,8 @@ def save_report(
     """Write recursion.npz and summary.json, which `jaxmpc verify` proves again, and remove a
     picture of an earlier report.
 
-    config: JSON data that the problem is made of, with its name. least: the smallest horizon, where
-    it was looked for.
+    report: of `recursive_feasibility`. config: JSON data that the problem is made of, with its
+    name. least: the smallest horizon, where it was looked for.
     """
     loops, body, worst = report.loops, report.feasible_set, report.counterexample
     facets = {}

@@ -54,7 +54,8 @@ def map_robot(
     """Label each state twice: what the linear model of `mpc` predicts, and what the robot does.
 
     Arguments:
-        mpc: hard limits, linear about the set-point, from `robot_mpc` (target: as given there).
+        mpc: hard limits, linear about the set-point, from `robot_mpc`.
+        target: as given to `robot_mpc`; None: home.
         x0s: points (B, d) in coordinates ξ. axes: indices of the d mapped coordinates, None for
             all; fixed (n,): values of the others, None for those of `robot.home`.
         seconds: length T·dt of the closed loops, in which home (or target) is held as reference.
@@ -66,6 +67,7 @@ def map_robot(
             set. "recursion": the linear closed loop has a plan at each of T time steps
             (`recursive_feasibility`, which spends at most about search_seconds on claims about all
             states), and so has the robot.
+        search_seconds: seconds for claims about all states, with claim="recursion".
         chunk: loops that run at once (None: 256 on a CPU, 8192 on a GPU). gap: as in
             `map_feasible_set`.
 

@@ -84,12 +84,15 @@ class RobotLoops:
 class RobotMap:
     """States of a robot with what the linear model predicts and what became of it.
 
-    x0s (B, d) in the coordinates `axes` of ξ, the other coordinates at `linear.fixed`.
-    linear: the map of the linear problem, x_0 within the robot's limits included. claim: "limits",
-    linear.label predicts for a state that all limits are kept for T time steps, and it holds where
-    the robot keeps them; or "recursion", the linear closed loop predicts a plan at each of T time
-    steps (recursion: the report; its states are deviations from set_point (n,)), and it holds where
-    the robot has them. loops: what the robot did in `steps` T time steps of dt seconds.
+    Its x0s (B, d) are in the coordinates `axes` of ξ, the other coordinates at `linear.fixed`.
+
+    claim: "limits", linear.label predicts for a state that all limits are kept for T time steps,
+    and it holds where the robot keeps them; or "recursion", the linear closed loop predicts a plan
+    at each of T time steps, and it holds where the robot has them.
+    linear: the map of the linear problem, x_0 within the robot's limits included.
+    recursion: the report of the second claim, None for the first; its states are deviations from
+    set_point. loops: what the robot did. steps: T, of dt seconds each.
+    set_point (n,): about which the model is linear.
     """
 
     robot: Robot | LinearPlant

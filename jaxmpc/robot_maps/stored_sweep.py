@@ -88,8 +88,8 @@ def sweep_robot(
         grid: points along each axis, ends included. lower, upper: its ends; None: the limits, 3 %
             wider on each side.
         resume: go on with the map in the folder. overwrite: replace it, once there are results.
-        devices: as in `map_feasible_set`, and so are settings: iterations and dtype of the linear
-            labels. progress: say on stderr what is done.
+        devices: as in `map_feasible_set`. progress: say on stderr what is done.
+        settings: iterations and dtype of the linear labels, as in `map_feasible_set`.
 
     Raises ValueError for wrong arguments before anything compiles, where there is a map and neither
     resume nor overwrite, and for another map than the one to resume.

@@ -43,12 +43,15 @@ def render(
     states: (T+1, nq + nv) of one robot, or (B, T+1, nq + nv) of several, drawn as tiles, row by
     row, in a nearly square arrangement. inputs: (T, m) or (B, T, m), for their limits alone.
     target: a configuration (nq,), or one for each state (T+1, nq), of a green, see-through robot in
-    each tile; None for none. width, height: pixels of a tile. camera: the name of one of the
-    model's; None, or "view" where the model has none of that name, for a camera that sees all that
-    moves, at all times. What a model without a skybox leaves black is grey.
+    each tile; None for none. every: states from one frame to the next. width, height: pixels of a
+    tile. camera: the name of one of the model's; None, or "view" where the model has none of that
+    name, for a camera that sees all that moves, at all times. What a model without a skybox leaves
+    black is grey.
 
-    labels: write the robot's name and the time in s above, a legend below, and `numbers` (by
-    default from 0) on the tiles. A tile has a red frame, with the name of the limit, where the
+    labels: write the robot's name and the time in s above, a legend below, and numbers on the
+    tiles. numbers: those of the robots, None: from 0.
+
+    A tile has a red frame, with the name of the limit, where the
     robot is beyond one (by more than 1e-6) at a sample from the one shown to the last before the
     next frame; of several it is the one exceeded most as a fraction of half its range.
 
@@ -230,7 +233,9 @@ def _add_ghost(scene: "mujoco.MjvScene", model: "mujoco.MjModel", data: "mujoco.
 
 @record
 class Film:
-    """Frames (F, h, w, 3), uint8, of `render`, at `fps` of them a second: notebooks play it.
+    """A film of `render`'s frames, which notebooks play.
+
+    frames: (F, h, w, 3), uint8. fps: frames a second.
 
     It is an image in the page (a GIF), so that a saved notebook needs no file beside it.
     Raises ValueError for other frames.

@@ -63,7 +63,8 @@ def load_robot(
             |.| ≤ v, inputs in units of ctrl. They bind the controller; the joint stops of the plant
             stay, and its motors apply any input that they are given.
         home: configuration (nq,) in place of the file's.
-        control_period: seconds between inputs; a multiple of timestep, the physics step (s).
+        control_period: seconds between inputs; a multiple of timestep.
+        timestep: the physics step in s, in place of the file's.
         floating_base: of a URDF, whether its root link moves freely; else it is welded to the
             world.
         mend_inertias: of a URDF, whether inertias that no body can have (principal moments that are

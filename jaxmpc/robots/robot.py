@@ -51,10 +51,12 @@ class Robot(RobotDescription):
     Units are MuJoCo's: m, rad, s, kg, N, N m.
 
     state_limits (in ξ), input_limits: Boxes, ±inf for no limit. home (nq + nv + na,): the set-point
-    of the file. anchor (nq,): zeros, with the orientations of home. plant, predictor: `Physics`,
-    constants of compiled programs (twice to ten times as fast as arguments). numbers: parameters of
-    the plant that differ in a batch (masses, damping), see `vary`. notes: (kind, text) of what
-    `load_robot` found, see `report`. file: the mujoco.MjModel as it was given.
+    of the file. substeps: physics steps of a control period. dt: the control period in s.
+    state_names, state_units: of the n coordinates. input_names, input_units: of the m inputs.
+    anchor (nq,): zeros, with the orientations of home. plant, predictor: `Physics`, constants of
+    compiled programs (twice to ten times as fast as arguments). numbers: parameters of the plant
+    that differ in a batch (masses, damping), see `vary`. notes: (kind, text) of what `load_robot`
+    found, see `report`. file: the mujoco.MjModel as it was given.
     """
 
     def step(self, x: Any, u: Any) -> Array:

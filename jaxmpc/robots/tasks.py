@@ -24,7 +24,11 @@ KINDS = ("site", "body", "geom")
 
 def position(robot: Robot, name: str, kind: str = "site") -> Callable[[Any], Array]:
     """Return the function that gives the position (3,) in m, in the world, of a site, a body or
-    the centre of a geom. Raises ValueError for a name that the model does not have."""
+    the centre of a geom.
+
+    name: its name in the file. kind: "site", "body" or "geom". Raises ValueError for a name that
+    the model does not have.
+    """
     i, field = _number(robot, kind, name), "xpos" if kind == "body" else f"{kind}_xpos"
     return lambda data: getattr(data, field)[i]
 
@@ -34,6 +38,9 @@ def orientation(
 ) -> Callable[[Any], Array]:
     """Return the function that gives the rotation vector (3,) in rad, in the world, that turns the
     target orientation, a quaternion (w first), into that of a site, body or geom.
+
+    name: of the site, body or geom. target: a quaternion (w, x, y, z). kind: "site", "body" or
+    "geom".
 
     Its length is the angle between both, at most π, where it has no derivative.
     """

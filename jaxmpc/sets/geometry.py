@@ -46,7 +46,8 @@ class Empty(ValueError):
 class Frame(NamedTuple):
     """{G x <= g} about a point inside, in coordinates of like size: Z ((x - center) / scale) <= 1.
 
-    The entries of Z (rows, n) are at most 1 in size.
+    Z (rows, n): rows with entries of at most 1 in size. center (n,): the point inside. scale (n,):
+    the size of the set along each coordinate.
     """
 
     Z: np.ndarray

@@ -33,6 +33,7 @@ class Check:
 
     holds: True, False, or None for undecided.
     margin: by how much, in `unit`; negative if it fails, None if there is no number.
+    unit: of the margin. sentence: the result in words.
     theorems: which of the two theorems (1, 3) need it.
     """
 
@@ -48,7 +49,7 @@ class Check:
 class TerminalReport:
     """What `verify_terminal` found: `report["Lyapunov inequality"]` is one check, `str` a table.
 
-    K: (m, n), the law that was checked, or None.
+    checks: all of them. K: (m, n), the law that was checked, or None.
     certificate: (rows, rows) M >= 0 with M H = H (A+BK) and M h <= factor h for a terminal set
         {H x <= h} with rows of norm 1, or None.
     factor: the set is mapped into itself scaled by this (an ellipsoid: into level * factor).

@@ -22,18 +22,21 @@ class ClosedLoopLoss:
         (1/T) Σ_{t<T} [ e_t'Q e_t + v_t'R v_t ] + violation·(1/T) Σ_{t≤T} Σ_i excess_i(x_t)
         + settling·(time to settle),    e_t = x_t − r_t,  v_t = u_t − s_t.
 
-    Q (n, n) and R (m, m), or their diagonals, are fixed: the controller's own weights, which
-    `Run.stage_cost` uses, would be driven to zero. reference r, input_reference s: (n,) and (m,),
-    or with at least T rows; None for zero. limits: Box or Polytope of x; excess_i is by how much
-    row i is violated, in its unit, of a Box as a fraction of its half-width (1 where infinite).
-    The term is an exact penalty: with a large enough weight limits are kept wherever they can be.
+    Q (n, n), R (m, m): or their diagonals, or a number for one state or input. They are fixed: the
+    controller's own weights, which `Run.stage_cost` uses, would be driven to zero.
+    reference: r (n,), or at least T rows; None for zero.
+    input_reference: s (m,), or at least T rows; None for zero.
+    limits: Box or Polytope of x; excess_i is by how much row i is violated, in its unit, of a Box
+    as a fraction of its half-width (1 where infinite).
+    violation: weight ≥ 0 of the excess, an exact penalty: with a large enough weight limits are
+    kept wherever they can be. settling: weight ≥ 0 of the time to settle.
+    band (n,): the size of what counts as settled, needed where settling > 0.
+    softness: of the count of samples, > 0.
+    plant: a robot whose `coordinates` turn its states into x; None: x is the state itself.
 
     Time to settle, in samples: the number of t after which the loop is still once outside the band
     |e_i| ≤ band_i. With d_t = max_i |e_i|/band_i it counts Σ_t (1 − Π_{s≥t} σ((1 − d_s)/softness)),
-    which tends to that number as softness → 0 (σ the logistic function). band (n,) is needed where
-    settling > 0.
-
-    plant: a robot whose `coordinates` turn its states into x; None: x is the state itself.
+    which tends to that number as softness → 0 (σ the logistic function).
     """
 
     Q: Any

@@ -190,11 +190,13 @@ def run_folder(
 ) -> Iterator[Path]:
     """Open the folder of a new run, or of one that is resumed, and give the path of its checkpoint.
 
-    files[0] is the record of the run, a JSON file that holds the options. All files are removed,
-    and a new record is written. Those of a run that is overwritten are put aside, and come back
-    at the end, whatever ends it, unless the new run has a checkpoint.
-    Raises ValueError where the folder holds a run with other options, or any run without `resume`
-    or `overwrite`.
+    files: names in the folder; the first is the record of the run, a JSON file that holds the
+    options. options: JSON data of the run.
+
+    All files are removed, and a new record is written. Those of a run that is overwritten are put
+    aside, and come back at the end, whatever ends it, unless the new run has a checkpoint. Raises
+    ValueError where the folder holds a run with other options, or any run without `resume` or
+    `overwrite`.
     """
     record, checkpoint = folder / files[0], folder / CHECKPOINT
     _settle(folder)

@@ -48,9 +48,11 @@ Values = Mapping[str, Any]
 class WeightTask:
     """Weights to tune, from `linear_task` or `robot_task`.
 
-    make: values → MPC or controller. x0s (B, n or nq + nv) and variations (B, ...), of which the
-    last `validation` are for validation. limits: of the states, not tightened. mpc: the problem
-    before tuning, with hard limits. dtype: of loops and derivatives.
+    make: values → MPC or controller. x0s (B, n or nq + nv): initial states.
+    variations: of the plants, name → (B, ...), as in `simulate_many`.
+    validation: so many of the last initial states are for validation. loss: of a run.
+    limits: of the states, not tightened. mpc: the problem before tuning, with hard limits.
+    dtype: of loops and derivatives.
     """
 
     name: str
@@ -136,6 +138,7 @@ def weight_parameters(
 ) -> dict[str, Parameter]:
     """Return what is tuned, of Q, R, P, rho and tightening, as it is at the start.
 
+    tune: names of these.
     weights: "diagonal" or "full", the form of Q and R; P is full unless it starts diagonal. rho:
     the L1 weight of soft limits. margin: the tightening of the state `limits` at the start, which
     is at most TIGHTEST and leaves the target (n,) inside. Raises ValueError for a weight that is
@@ -247,6 +250,7 @@ def robot_task(
 ) -> WeightTask:
     """Return the task of a robot under `RobotController`, which rests at `target`.
 
+    terminal_weight, terms: as in `linear_task`. target: configuration to rest at.
     mpc: of `robot_mpc` for this target. x0s, factors: of `draw_robots`; the MPC keeps
     the nominal model. linearize, rho, solver: of `RobotController`. The rest as in `linear_task`.
     """
@@ -298,7 +302,8 @@ def weight_loss(
 ) -> ClosedLoopLoss:
     """Return the loss of a task: `ClosedLoopLoss` with weights of its own.
 
-    tracking, effort: diagonals in place of Q and R. tolerance: fraction of half the range of each
+    tracking, effort: diagonals in place of Q and R. violation, settling: weights of these terms,
+    see `ClosedLoopLoss`. tolerance: fraction of half the range of each
     state that counts as settled.
     """
     Q, R = (

@@ -71,10 +71,11 @@ def verify_map(
     the folder of a report of `jaxmpc recursion`, whose counterexample, and next states that count
     as lost after one step, are proved again too. exact: all plans in exact arithmetic, else a
     random sample of them and those with margins near rounding, the others in float64; half-spaces
-    are exact always. What summary.json beside it counts is compared. check: takes the attributes
-    and axes of the store before its labels are read, and returns what is wrong with them. Nothing
-    is written. Where the store is damaged, `problems` says where, and no label is looked at unless
-    its data can be read. Raises ValueError where there is no store.
+    are exact always. sample: plans of that random sample. What summary.json beside it counts is
+    compared. check: takes the attributes and axes of the store before its labels are read, and
+    returns what is wrong with them. Nothing is written. Where the store is damaged, `problems` says
+    where, and no label is looked at unless its data can be read. Raises ValueError where there is
+    no store.
     """
     path = find_store(path)
     report = isinstance(path, Path) and path.suffix == ".npz"

@@ -83,8 +83,8 @@ class OfflineReport:
     feasible_set: map of initial states with proofs, of the problem with its soft rows hard; volume:
     lower and upper bound of its volume. recursion, penalty, terminal: the reports of
     `recursive_feasibility`, `exact_penalty` and `verify_terminal`. loops: closed loops that were
-    simulated, not proved. None, with the reason in `notes`, where they do not apply or the time was
-    over.
+    simulated, not proved. None, where they do not apply or the time was over.
+    notes: the reasons for what is None.
     variables, rows, condition: sizes of the condensed QP and condition number of its Hessian.
     """
 
@@ -154,6 +154,7 @@ def offline_report(
             map, and in more than three dimensions to follow in the recursion test. None: a grid
             over the feasible set, in more than three dimensions random points of its bounding box;
             those of `recursive_feasibility` for its test.
+        steps: length of the closed loops. loops: how many of them.
         K: terminal law to verify, (m, n); None: that of the LQR.
         seconds: time limit of the whole call. Linear programs take seconds, thousands of facets or
             critical regions minutes; compiling takes some 15 s for the map and 20 s for the closed
