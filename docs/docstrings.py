@@ -1,6 +1,7 @@
 """What the reference shows beside the text of docstrings: constructors that decorators make, and
 tables of arguments or fields, read from the text that describes them."""
 
+import ast
 import functools
 import re
 from pathlib import Path
@@ -10,6 +11,8 @@ import griffe
 
 # Decorators of `jaxmpc.pytrees`, which make dataclasses.
 MAKERS = {"pytree", "prepared_pytree", "record", "static_pytree", "dataclass"}
+# Functions that describe a field.
+FIELDS = {"field", "static"}
 # Begins a sentence that goes on with what the one before says of an argument.
 GOES_ON = re.compile(
     r"(?:None|With|Without|It|Its|True|False|Each|Else|Where|If|These|Those|They|Them|Both|The"
@@ -62,22 +65,34 @@ def _fields(cls: Any) -> list[griffe.Parameter]:
     for name, member in cls.members.items():
         if member.is_alias or not member.is_attribute or member.annotation is None:
             continue
-        text = str(member.value or "")
         if "property" in member.labels or str(member.annotation).startswith("ClassVar"):
             continue
-        if name == "_" or re.match(r"(?:dataclasses\.)?field\(.*init=False", text):
-            keywords = keywords or name == "_"  # `_: KW_ONLY`
+        keywords = keywords or name == "_"  # `_: KW_ONLY`
+        given, default = _default(member.value)
+        if name == "_" or not given:
             continue
-        default = member.value
-        if re.match(r"(?:static|field|dataclasses\.field)\(", text):
-            given = re.search(r"default=(.*?)\)$", text)
-            default = given[1] if given else None
         kinds = griffe.ParameterKind
         kind = kinds.keyword_only if keywords else kinds.positional_or_keyword
         found[name] = griffe.Parameter(
             name, annotation=member.annotation, kind=kind, default=default
         )
     return list(found.values())
+
+
+def _default(value: Any) -> tuple[bool, Any]:
+    """Return whether the constructor takes a field, and its default, from what its class says."""
+    try:
+        call = ast.parse(str(value), mode="eval").body
+    except SyntaxError:
+        return True, value
+    if not isinstance(call, ast.Call) or ast.unparse(call.func).split(".")[-1] not in FIELDS:
+        return True, value
+    options = {option.arg: ast.unparse(option.value) for option in call.keywords}
+    if options.get("init") == "False":
+        return False, None
+    if "default_factory" in options:
+        return True, f"{options['default_factory']}()"
+    return True, options.get("default")
 
 
 def _tabulate(obj: Any) -> None:

@@ -28,8 +28,13 @@ class LinearPlant:
     name: str = static(default="linear")
 
     def __post_init__(self) -> None:
-        if isinstance(self.system, LinearSystem) and self.home is None:
+        if not isinstance(self.system, LinearSystem):
+            return
+        if self.home is None:
             object.__setattr__(self, "home", np.zeros(self.n))
+        for name, size in (("state_limits", self.n), ("input_limits", self.m)):
+            if isinstance(getattr(self, name), Box):
+                object.__setattr__(self, name, getattr(self, name).spread(size))
 
     def validate(self) -> None:
         """Raise ValueError for a bad system, or limits of other sizes."""

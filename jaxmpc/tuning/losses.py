@@ -53,9 +53,9 @@ class ClosedLoopLoss:
     def __post_init__(self) -> None:
         for name in ("Q", "R"):
             W = np.asarray(getattr(self, name), np.float64)
-            W = np.diag(W) if W.ndim == 1 else W
+            W = np.diag(np.atleast_1d(W)) if W.ndim < 2 else W
             if W.ndim != 2 or W.shape[0] != W.shape[1]:
-                fail(name, f"shape {W.shape}", "Give a square matrix or its diagonal")
+                fail(name, f"shape {W.shape}", "Give a square matrix, its diagonal or a number")
             require_symmetric_psd(name, W)
             object.__setattr__(self, name, W)
         for name in ("violation", "settling"):

@@ -185,6 +185,8 @@ def linear_task(
     steps: int = 50,
     validation: float = 0.25,
     dtype: str = "float64",
+    reference: Reals | None = None,
+    input_reference: Reals | None = None,
     **terms: Any,
 ) -> WeightTask:
     """Return the task of a linear problem with hard limits, controlled by `Controller`.
@@ -220,9 +222,9 @@ def linear_task(
         x0s=np.asarray(x0s),
         variations={},
         validation=_validation(validation, len(np.asarray(x0s))),
-        loss=weight_loss(mpc.Q, mpc.R, limits, **terms),
-        reference=None,
-        input_reference=None,
+        loss=weight_loss(mpc.Q, mpc.R, limits, reference, input_reference, **terms),
+        reference=None if reference is None else np.asarray(reference, float),
+        input_reference=None if input_reference is None else np.asarray(input_reference, float),
         steps=steps,
         solver=solver,
         dtype=dtype,

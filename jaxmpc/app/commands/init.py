@@ -7,7 +7,7 @@ from typing import Annotated
 from jaxmpc.app.commands.options import Switch, option
 from jaxmpc.checks import fail
 
-TEMPLATE = Path(__file__).parents[1] / "template.toml"
+TEMPLATE, FULL = (Path(__file__).parents[1] / name for name in ("template.toml", "full.toml"))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -18,11 +18,14 @@ class Init:
       $ jaxmpc init
       $ jaxmpc sweep --config problem.toml
 
-    The file holds a small working problem, and each option as a comment.
+    The file holds a small working problem, and what is asked for most as comments; with --full
+    every key that there is.
     """
 
     output: Annotated[Path, option("FILE", "problem.toml")] = Path("problem.toml")
     """The TOML file to write."""
+    full: Switch = False
+    """Show every key of every section."""
     overwrite: Switch = False
     """Replace the file where there is one."""
 
@@ -30,7 +33,10 @@ class Init:
 
     def run(self) -> None:
         """Write the file. Raises ValueError where it exists or cannot be written."""
-        where, text = f"--output {self.output}", TEMPLATE.read_text(encoding="utf-8")
+        where, text = (
+            f"--output {self.output}",
+            (FULL if self.full else TEMPLATE).read_text("utf-8"),
+        )
         try:
             with self.output.open("w" if self.overwrite else "x", encoding="utf-8") as file:
                 file.write(text.replace("FILE", str(self.output)))

@@ -96,11 +96,17 @@ class Sweep:
       name = "joint"
       [system]  A, B, dt; optional c, state_names, state_units, input_names, input_units,
                 continuous = true (A, B, c of dx/dt, the input held over dt)
-      [limits]  u_min, u_max, and x_min, x_max (inf allowed) or H_x, h_x (H_x x <= h_x)
+      [limits]  u_min, u_max, and x_min, x_max (inf allowed) or H_x, h_x (H_x x <= h_x); optional
+                input_rate_limit: |u(k) - u(k-1)| <= it; states are then (x, previous u)
       [cost]    Q, R, P = "lqr" | "Q" | "none" | matrix; a flat list is a diagonal; optional rho,
-                the L1 weight of soft limits, a number or "exact" (jaxmpc info; sets stay hard)
+                the L1 weight of soft limits, a number or "exact" (jaxmpc info; sets stay hard),
+                input_rate_weight, stage_weights
       [mpc]     horizon; optional terminal, constrain_initial = false (no limits at k = 0),
-                control_horizon (free inputs, the last one is held)
+                constrained_stages, control_horizon (free inputs, the last one is held, or lengths
+                of blocks that share an input)
+      [[outputs]]  optional, repeated: lower <= C x + D u <= upper; stages, names, units; soft
+                with rho, its L1 weight, and quadratic
+      [reference]  optional: state and input that closed loops track (jaxmpc tune weights)
       [disturbance]  optional: w_min, w_max; E of x+ = A x + B u + E w, gain of the policy
                 u = v + gain (x - z): feasible means that all limits are kept for every such w
       and what jaxmpc tune writes, see its help: [limits] margin, [mpc] H_f, h_f or P_f, level_f,

@@ -385,7 +385,7 @@ def problem_of_file(command: TuneWeights) -> WeightProblem:
     hard, rho = config.build_mpc(), config.cost.rho
     if rho is not None:  # the number that "exact" stands for
         soft = config.build_controlled().soft
-        rho = float(np.asarray(soft[0].rho)) if isinstance(soft, tuple) and soft else 0.0
+        rho = float(np.asarray(soft[-1].rho)) if isinstance(soft, tuple) and soft else 0.0
     config = with_numbers(config, hard, rho)
     solver = dataclasses.replace(
         config.build_solver() or SOLVER, **given_options(command, "iterations", "newton_steps")
@@ -419,6 +419,7 @@ def problem_of_file(command: TuneWeights) -> WeightProblem:
         limits=limits,
         solver=solver,
         steps=steps,
+        **config.references(),
         **arguments(command, linear_task, weight_loss, leave=("steps",)),
     )
 

@@ -3,9 +3,12 @@
     name = "joint"
 
     [system]  A, B, c, dt, continuous, state_names, state_units, input_names, input_units
-    [limits]  x_min, x_max, margin  or  H_x, h_x;  u_min, u_max
-    [cost]    Q, R, P, rho
-    [mpc]     horizon, terminal  or  H_f, h_f  or  P_f, level_f;  constrain_initial, control_horizon
+    [limits]  x_min, x_max, margin  or  H_x, h_x;  u_min, u_max, input_rate_limit
+    [cost]    Q, R, P, rho, input_rate_weight, stage_weights
+    [mpc]     horizon, terminal  or  H_f, h_f  or  P_f, level_f;  constrain_initial,
+              constrained_stages, control_horizon
+    [[outputs]]  C, lower, upper, D, stages, names, units; soft with rho, quadratic
+    [reference]  state, input
     [disturbance]  w_min, w_max, E, policy, gain
     [solver]  iterations, rho, alpha, newton_steps
     [sweep]   grid, lower, upper, axes, fixed | projection, iterations, dtype

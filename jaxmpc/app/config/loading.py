@@ -28,6 +28,15 @@ from jaxmpc.checks import fail, nearest, require_memory, require_printable, show
 from jaxmpc.files import text_within
 from jaxmpc.mpc.condense import condensed_bytes
 
+# Keys for which a number may stand, and how many entries the list has.
+NUMBERS = {
+    "limits": {
+        **dict.fromkeys(("x_min", "x_max"), "n"),
+        **dict.fromkeys(("u_min", "u_max", "input_rate_limit"), "m"),
+    },
+    "cost": {"Q": "n", "P": "n", "R": "m", "input_rate_weight": "m"},
+    "reference": {"state": "n", "input": "m"},
+}
 # A problem of a hundred states takes a tenth of that; what tomllib makes of a byte, up to 10 kB.
 MOST_BYTES = 10**6
 # Time and memory of tomllib grow as the square of the parts of a dotted key: one of 60 kB took
@@ -91,9 +100,33 @@ def load(
 
 def from_results(document: Mapping[str, Any], command: str = "sweep") -> Config:
     """Return the configuration that results hold (`Config.to_dict`), checked as `load` does."""
-    config = _validated(ADAPTER, document, Config)
+    config = _validated(ADAPTER, _spread(document), Config)
     check(config, command)
     return config
+
+
+def _spread(document: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a file in which numbers stand for lists, and a flat list for the column B of a single
+    input, with these lists: as Python takes them."""
+    found = {key: dict(part) if isinstance(part, dict) else part for key, part in document.items()}
+    system = found.get("system")
+    A, B = (system.get(key) if isinstance(system, dict) else None for key in ("A", "B"))
+    if not isinstance(system, dict) or not isinstance(A, list | tuple):
+        return found
+    if isinstance(B, list | tuple) and not any(isinstance(row, list | tuple) for row in B):
+        system["B"] = B = [[number] for number in B]
+    try:
+        sizes = {"n": len(A), "m": len(B[0])}  # type: ignore[index, arg-type]
+    except (TypeError, IndexError, KeyError):
+        return found
+    for section, keys in NUMBERS.items():
+        part: Any = found.get(section)
+        for key, size in keys.items() if isinstance(part, dict) else ():
+            value = part.get(key)
+            # A weight stands for itself, a limit for all coordinates.
+            if type(value) in (int, float) and (section != "cost" or sizes[size] == 1):
+                part[key] = [value] * sizes[size]
+    return found
 
 
 def load_robot_config(path: str | Path) -> RobotConfig:
@@ -137,7 +170,8 @@ def _error_message(error: ValidationError, whole: Any) -> str:
     """Return the first thing wrong in one line: where, what, and what is allowed there."""
     unknown = "unexpected_keyword_argument"  # first: a misspelt key is also a missing one
     first = min(error.errors(), key=lambda e: e["type"] != unknown)
-    where = [str(part) for part in first["loc"][:2]]
+    place = lambda e: [part for part in e["loc"] if not isinstance(part, int)][:2]
+    where = [str(part) for part in place(first)]
     key = ".".join(where)
     if first["type"] == unknown:
         return _unknown_key(where, whole)
@@ -145,7 +179,7 @@ def _error_message(error: ValidationError, whole: Any) -> str:
         return f"{key} is missing. Add it (jaxmpc sweep --help lists all keys)"
     if first["type"] == "dataclass_type":
         return f"{key}: is no section. Write [{key}] above its keys"
-    same = [e for e in error.errors() if [str(part) for part in e["loc"][:2]] == where]
+    same = [e for e in error.errors() if place(e) == where]
     problems = dict.fromkeys(e["msg"].removeprefix("Value error, ") for e in same)
     # TOML and the help say list, Python tuple.
     text = "; or ".join(problems).replace("tuple", "list").replace("Tuple", "List")
@@ -175,7 +209,7 @@ def _keys(whole: Any, section: str | None = None) -> list[str]:
 
 def check(config: Config, command: str = "sweep") -> None:
     """Raise ValueError where keys that are valid alone do not fit one another."""
-    s, limits = config.system, config.limits
+    s, limits, target = config.system, config.limits, config.reference
     n, m = len(s.A), len(s.B[0])
     require_printable("name", config.name)
     for key, value, count in (
@@ -193,6 +227,10 @@ def check(config: Config, command: str = "sweep") -> None:
         ("cost.Q", config.cost.Q, n),
         ("cost.R", config.cost.R, m),
         ("cost.P", None if isinstance(config.cost.P, str) else config.cost.P, n),
+        ("limits.input_rate_limit", limits.input_rate_limit, m),
+        ("cost.input_rate_weight", config.cost.input_rate_weight, m),
+        ("reference.state", None if target is None else target.state, n),
+        ("reference.input", None if target is None else target.input, m),
     ):
         if value is not None and len(value) != count:
             what = f"{m} inputs" if count == m != n else f"{n} states, {m} inputs"
@@ -213,11 +251,27 @@ def check(config: Config, command: str = "sweep") -> None:
             value = getattr(given, key)
             if value is not None and np.shape(value) != shape:
                 fail(f"disturbance.{key}", f"shape {np.shape(value)}", f"Give {shape}")
+    for i, rows in enumerate(config.outputs):
+        where = f"outputs.{i}"
+        if rows.lower is None and rows.upper is None:
+            fail(where, "has neither lower nor upper", "Give one of them, or both")
+        if rows.quadratic is not None and rows.rho is None:
+            fail(f"{where}.quadratic", "given without rho", "Soft rows have a weight rho")
+        p = len(rows.C)
+        for key, size in (("lower", p), ("upper", p), ("D", p), ("names", p), ("units", p)):
+            value = getattr(rows, key)
+            if value and len(value) != size:
+                what = f"has {len(value)} entries where {size} are needed"
+                fail(f"{where}.{key}", what, "One for each row of C")
+        for key, size in (("C", n), ("D", m)):
+            value = getattr(rows, key)
+            if value is not None and len(value[0]) != size:
+                fail(f"{where}.{key}", f"has {len(value[0])} columns", f"Give {size}")
     require_horizon(config, "mpc.horizon", config.mpc.horizon)
     if command == "sweep":
-        _check_sweep(config, n)
+        _check_sweep(config, config.dimension)
     elif command == "recursion":
-        _check_recursion(config, n)
+        _check_recursion(config, config.dimension)
 
 
 def require_horizon(config: Config, key: str, horizon: int) -> None:
@@ -229,19 +283,23 @@ def require_horizon(config: Config, key: str, horizon: int) -> None:
 
 
 def _check_sweep(config: Config, n: int) -> None:
-    """Raise ValueError unless [sweep] fits a system of n states."""
+    """Raise ValueError unless [sweep] fits n states, previous inputs among them; those that are
+    neither mapped nor in `fixed` are zero."""
     sweep = config.sweep
-    d = len(mapped_axes(config))
+    axes = mapped_axes(config)
+    d = len(axes)
+    states = len([i for i in range(len(config.system.A)) if i not in axes])
     for key, count in (("grid", d), ("lower", d), ("upper", d), ("fixed", n - d)):
         value = getattr(sweep, key)
-        if value is not None and len(value) != count:
+        if value is not None and len(value) != count and (key != "fixed" or len(value) != states):
             cure = f"{n} states, of which {d} are mapped (sweep.axes)"
             fail(f"sweep.{key}", f"has {len(value)} entries where {count} are needed", cure)
     _check_order("sweep", sweep, "lower", "upper")
-    if d < n and (sweep.fixed is None) != sweep.projection:
+    both = sweep.fixed is not None and sweep.projection
+    if both or (states and sweep.fixed is None and not sweep.projection):
         cure = f"Give the {n - d} other values in sweep.fixed (a slice) or projection = true"
-        both = "fixed and projection exclude each other"
-        fail("sweep.fixed", both if sweep.projection else f"{n} states, {d} mapped", cure)
+        what = "fixed and projection exclude each other"
+        fail("sweep.fixed", what if both else f"{n} states, {d} mapped", cure)
     if d == n and sweep.projection:
         fail("sweep.projection", f"true, and all {n} states are mapped", "Name fewer in sweep.axes")
     section_ends(config, mapped_axes(config), sweep)
@@ -272,7 +330,7 @@ def state_bytes(config: Config, d: int | None = None) -> int:
     """Return the bytes of a state with its label and proofs in a map of d axes (None: those of
     [sweep]): the point, x_0, the plan, the half-space, label and status."""
     d = len(mapped_axes(config)) if d is None else d
-    n, m = len(config.system.A), len(config.system.B[0])
+    n, m = config.dimension, len(config.system.B[0])
     return 8 * (2 * d + n + config.mpc.horizon * m + 1) + 2
 
 

@@ -24,7 +24,7 @@ from pydantic.dataclasses import dataclass
 from jaxmpc.checks import MOST_COUNT
 from jaxmpc.explicit.exact_penalties import exact_penalty
 from jaxmpc.grids import axis_indices, grid, grid_ends, mesh
-from jaxmpc.mpc.problem import MPC, soften
+from jaxmpc.mpc.problem import MPC, Outputs, Soft, soften
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope
 from jaxmpc.sets.invariant import named_terminal_set
@@ -88,6 +88,7 @@ class LimitsSection:
     h_x: Vector | None = None  # (r,)
     u_min: Vector  # (m,)
     u_max: Vector  # (m,)
+    input_rate_limit: Vector | None = None  # (m,): |u_k - u_{k-1}| <= input_rate_limit
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -100,6 +101,9 @@ class CostSection:
     # L1 weight that makes state and terminal limits soft in the controller; "exact": the least one
     # that changes nothing where they can be kept, and a margin. Sets are those of the hard limits.
     rho: Annotated[Number, Field(ge=0)] | Literal["exact"] | None = None
+    # Adds Σ Δu'W Δu with Δu = u_k - u_{k-1}.
+    input_rate_weight: Vector | Matrix | None = None
+    stage_weights: Vector | None = None  # (N,) > 0: weighs x'Qx + u'Ru of each step
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -113,8 +117,35 @@ class MPCSection:
     h_f: Vector | None = None  # (r,)
     P_f: Matrix | None = None  # (n, n): x_N'P_f x_N <= level_f
     level_f: Annotated[Number, Field(gt=0)] | None = None
-    control_horizon: Annotated[Whole, Field(ge=1)] | None = None  # free inputs
+    # Number of free inputs, the last one held, or lengths of blocks that add up to the horizon.
+    control_horizon: (
+        Annotated[Whole, Field(ge=1)] | tuple[Annotated[Whole, Field(ge=1)], ...] | None
+    ) = None
     constrain_initial: Switch = True  # False: no state limits at k = 0
+    constrained_stages: tuple[Whole, ...] | None = None  # the k at which state limits hold
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class OutputsSection:
+    """Rows lower <= C x + D u <= upper of p outputs: hard, or with rho soft, at that L1 weight."""
+
+    C: Matrix  # (p, n)
+    lower: Limits | None = None  # (p,), -inf where free
+    upper: Limits | None = None  # (p,), inf where free
+    D: Matrix | None = None  # (p, m), none means zero
+    stages: tuple[Whole, ...] | None = None  # the k at which they hold, none means the usual ones
+    names: tuple[str, ...] = ()
+    units: tuple[str, ...] = ()
+    rho: Annotated[Number, Field(ge=0)] | Annotated[Vector, Field(min_length=1)] | None = None
+    quadratic: Annotated[Number, Field(ge=0)] | None = None  # weight of squares, with rho alone
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class ReferenceSection:
+    """What closed loops track in place of the origin; limits and sets stay where they are."""
+
+    state: Vector  # (n,)
+    input: Vector | None = None  # (m,), none means zero
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -167,6 +198,13 @@ class SolverSection:
     newton_steps: Annotated[Whole, Field(ge=0)] | None = None
 
 
+# Keys that results have only where they are given.
+NEWER = {
+    "": ("disturbance", "outputs", "reference"),
+    "limits": ("input_rate_limit",),
+    "cost": ("input_rate_weight", "stage_weights"),
+    "mpc": ("constrained_stages",),
+}
 # Commands that have a section of their own.
 SECTION_COMMANDS = ("sweep", "recursion")
 # Arguments by which errors of the library name what these keys give.
@@ -191,6 +229,10 @@ KEYS = {
     "disturbance_matrix": "disturbance.E",
     "gain": "disturbance.gain",
     "policy": "disturbance.policy",
+    "input_rate_limit": "limits.input_rate_limit",
+    "input_rate_weight": "cost.input_rate_weight",
+    "stage_weights": "cost.stage_weights",
+    "constrained_stages": "mpc.constrained_stages",
     "states.H": "limits.H_x",
     "states.h": "limits.h_x",
     "terminal_set.H": "mpc.H_f",
@@ -239,7 +281,9 @@ class Config:
     limits: LimitsSection
     cost: CostSection
     mpc: MPCSection
+    outputs: tuple[OutputsSection, ...] = ()
     disturbance: DisturbanceSection | None = None
+    reference: ReferenceSection | None = None
     sweep: SweepSection = SweepSection()
     recursion: RecursionSection = RecursionSection()
     solver: SolverSection | None = None
@@ -261,15 +305,22 @@ class Config:
     def to_dict(self, command: str = "sweep") -> dict[str, Any]:
         """Return the sections that a command reads as JSON data; infinity is "Infinity"."""
         data = json.loads(ADAPTER.dump_json(self))
-        if data["disturbance"] is None:  # as files had it before there was such a section
-            del data["disturbance"]
+        # As results had it before there were these keys.
+        for section, keys in NEWER.items():
+            part = data if section == "" else data[section]
+            for key in keys:
+                if not part[key]:
+                    del part[key]
         return {
             key: part for key, part in data.items() if key == command or key not in SECTION_COMMANDS
         }
 
     def to_toml(self) -> str:
         """Return the text of a file that `load` reads back as this very configuration."""
-        return to_toml(ADAPTER.dump_python(self, exclude_none=True))
+        document = ADAPTER.dump_python(self, exclude_none=True)
+        if not self.outputs:
+            del document["outputs"]
+        return to_toml(document)
 
     @_in_keys
     def build_mpc(self) -> MPC:
@@ -321,6 +372,12 @@ class Config:
             terminal_set=terminal_set,
             constrain_initial=self.mpc.constrain_initial,
             control_horizon=self.mpc.control_horizon,
+            constrained_stages=self.mpc.constrained_stages,
+            input_rate_limit=as_array(limits.input_rate_limit),
+            input_rate_weight=as_array(cost.input_rate_weight),
+            stage_weights=as_array(cost.stage_weights),
+            outputs=tuple(_outputs(rows) for rows in self.outputs if rows.rho is None),
+            soft=tuple(_soft(rows) for rows in self.outputs if rows.rho is not None),
             **against,
         )
         mpc.validate()
@@ -331,13 +388,34 @@ class Config:
         given = self.disturbance
         if given is None:
             return {}
-        array = lambda value: None if value is None else np.asarray(value)
         return {
             "disturbance": Box(np.asarray(given.w_min), np.asarray(given.w_max)),
-            "disturbance_matrix": array(given.E),
+            "disturbance_matrix": as_array(given.E),
             "policy": given.policy,
-            "gain": array(given.gain),
+            "gain": as_array(given.gain),
         }
+
+    @property
+    def dimension(self) -> int:
+        """Number of coordinates of an initial state: n, or n + m with the previous input where
+        input rates are limited."""
+        n, m = len(self.system.A), len(self.system.B[0])
+        return n if self.limits.input_rate_limit is None else n + m
+
+    @property
+    def coordinate_names(self) -> tuple[str, ...]:
+        """Names of these coordinates, where states have names."""
+        inputs = self.system.input_names or tuple(f"u{i + 1}" for i in range(len(self.system.B[0])))
+        names = self.system.state_names or ()
+        previous = tuple(f"previous {name}" for name in inputs) if names else ()
+        return (names + previous)[: self.dimension]
+
+    def references(self) -> dict[str, Any]:
+        """Return reference and input_reference of closed loops; none without [reference]."""
+        given = self.reference
+        if given is None:
+            return {}
+        return {"reference": as_array(given.state), "input_reference": as_array(given.input)}
 
     def build_controlled(self) -> MPC:
         """Return the problem that the controller solves: `build_mpc` softened by cost.rho."""
@@ -364,6 +442,16 @@ class Config:
         if limits.x_min is not None:
             return Box(np.asarray(limits.x_min), np.asarray(limits.x_max))
         return None
+
+    @_in_keys
+    def initial_range(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the ends of the smallest box round the initial states, `dimension` numbers each:
+        `state_range`, and the input limits where input rates are limited."""
+        lower, upper = self.state_range()
+        if self.dimension > len(self.system.A):
+            lower = np.concatenate([lower, self.limits.u_min])
+            upper = np.concatenate([upper, self.limits.u_max])
+        return lower, upper
 
     @_in_keys
     def state_range(self) -> tuple[np.ndarray, np.ndarray]:
@@ -463,10 +551,12 @@ def sweep_points(config: Config) -> SweepPoints:
     lower, upper = section_ends(config, axes, config.sweep)
     shape = grid_shape(config)
     along = tuple(np.linspace(*ends) for ends in zip(lower, upper, shape, strict=True))
-    if config.sweep.fixed is None:
+    if config.sweep.fixed is None and (config.sweep.projection or len(axes) == config.dimension):
         return SweepPoints(along, axes, None)
-    fixed = np.zeros(len(config.system.A))
-    fixed[[i for i in range(len(fixed)) if i not in axes]] = config.sweep.fixed
+    others = [i for i in range(config.dimension) if i not in axes]
+    fixed = np.zeros(config.dimension)
+    given = config.sweep.fixed or ()  # previous inputs that it leaves out are zero
+    fixed[others[: len(given)]] = given
     return SweepPoints(along, axes, fixed)
 
 
@@ -479,7 +569,7 @@ def grid_shape(config: Config) -> tuple[int, ...]:
 
 def recursion_states(config: Config) -> np.ndarray | None:
     """Return states (B, n) for `recursive_feasibility`; None for its own choice (n > 3)."""
-    shape, axes = recursion_shape(config), range(len(config.system.A))
+    shape, axes = recursion_shape(config), range(config.dimension)
     return None if shape is None else grid(*section_ends(config, axes, config.recursion), shape)
 
 
@@ -487,14 +577,14 @@ def recursion_shape(config: Config) -> tuple[int, ...] | None:
     """Return the number of sample states along each axis; None for those that
     `recursive_feasibility` chooses itself (n > 3)."""
     usual = {1: (1001,), 2: (128, 128), 3: (24, 24, 24)}
-    return config.recursion.grid or usual.get(len(config.system.A))
+    return config.recursion.grid or usual.get(config.dimension)
 
 
 def mapped_axes(config: Config) -> tuple[int, ...]:
     """Return the indices of the mapped states, which [sweep] gives by name or index."""
-    n, axes = len(config.system.A), config.sweep.axes
+    n, axes = config.dimension, config.sweep.axes
     given = tuple(range(min(2, n))) if axes is None else axes
-    return axis_indices("sweep.axes", "state", given, config.system.state_names or (), n)
+    return axis_indices("sweep.axes", "state", given, config.coordinate_names, n)
 
 
 def section_ends(
@@ -502,7 +592,7 @@ def section_ends(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the corners of the grid of [sweep] or [recursion]; see `grid_ends`."""
     where = "sweep." if isinstance(section, SweepSection) else "recursion."
-    limits = lambda: tuple(end[list(axes)] for end in config.state_range())
+    limits = lambda: tuple(end[list(axes)] for end in config.initial_range())
     return grid_ends(where, section.lower, section.upper, limits)
 
 
@@ -512,6 +602,39 @@ def to_toml(document: Mapping[str, Any]) -> str:
     line = lambda found: f"[{' '.join(part.strip() for part in found[1].splitlines())}]"
     # What holds a bracket of its own, a matrix or a name with one, stays as it is.
     return re.sub(r"\[\n([^\[\]]+?),?\n *\]", line, text)
+
+
+def as_array(value: Any) -> np.ndarray | None:
+    """Return a key's numbers as an array; None for a key that is not given."""
+    return None if value is None else np.asarray(value, dtype=np.float64)
+
+
+def _outputs(rows: OutputsSection) -> Outputs:
+    """Return hard rows of outputs."""
+    return Outputs(
+        np.asarray(rows.C),
+        as_array(rows.lower),
+        as_array(rows.upper),
+        as_array(rows.D),
+        rows.stages,
+        rows.names,
+        rows.units,
+    )
+
+
+def _soft(rows: OutputsSection) -> Soft:
+    """Return soft rows of outputs."""
+    return Soft(
+        np.asarray(rows.C),
+        as_array(rows.lower),
+        as_array(rows.upper),
+        np.asarray(rows.rho),
+        rows.quadratic or 0.0,
+        as_array(rows.D),
+        rows.stages,
+        rows.names,
+        rows.units,
+    )
 
 
 def to_matrix(value: Any) -> np.ndarray:
