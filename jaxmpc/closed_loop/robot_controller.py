@@ -245,7 +245,8 @@ class RobotController:
 
     `controller(x, before, reference, input_reference=)` as `Controller`, x (nq + nv,) the state of
     the robot, references in its coordinates (see `robot.trajectory`). `start` gives the first
-    `before`, and takes the first point of linearisation from input_reference.
+    `before`, and takes the first point of linearisation and the previous input, of which rates are
+    measured, from input_reference.
 
     A pytree. Calling the class prepares the problem; JAX and `tree_map` rebuild
     the object without that, `dataclasses.replace` prepares it again. Raises ValueError for
@@ -346,8 +347,13 @@ class RobotController:
         problem = self.problem
         rows = layout(self.soft) + task_layout(problem)
         memory = None if before is None else before.memory
+        last = previous_input if previous_input is not None or before is None else before.u
+        if last is not None:
+            last = jnp.asarray(last)
+            last = limited(self.soft.inputs, jnp.where(jnp.isfinite(last), last, 0.0))
         start = None if memory is None else memory.shifted(rows, memory.inputs[-1])
-        given: dict[str, Any] = {"input_reference": input_reference, "scale": self.scale}
+        given: dict[str, Any] = {"input_reference": input_reference, "previous_input": last}
+        given["scale"] = self.scale
         xi = self.coordinates(x)
         if self.linearize == "trajectory":
             if start is None:
@@ -362,7 +368,7 @@ class RobotController:
             system = self.robot.linearize(x, limited(self.soft.inputs, inputs[0]), exact=self.exact)
             mpc = replace(self.soft, system=system)
             plan = solve_stagewise(mpc, xi, reference, self.solver, start, **given)
-        return applied(self.soft, rows, plan, memory)
+        return applied(self.soft, rows, plan, memory, last)
 
     @property
     def problem(self) -> NonlinearMPC:

@@ -142,7 +142,7 @@ def simulate(
         controller, (n,), or (T + N − 1, n): the plan at step t sees the rows t … t+N−1. It does not
         act by itself. None: nothing is known ahead.
     previous_input (m,): u_{−1} where the problem limits or weighs input rates, or where inputs are
-        delayed; None for zero.
+        delayed; None for zero, with a RobotController for the first input of input_reference.
     noise: `Noise` of the plant and of what is measured; None for none.
     observer: a `KalmanFilter`; the controller sees its estimate, `run.estimates`. None: that of an
         OffsetFreeController, or the controller sees the state, with the measurement noise if there
@@ -407,7 +407,7 @@ def _simulate(
     loop, system = Loop(controller, plant, given, x0.dtype), controller.mpc.system
     observer, previous = loop.observer, given.previous_input
     before = controller.start(x0, loop.rows(given.input_reference, loop.later, loop.horizon))
-    previous = jnp.zeros(system.m, x0.dtype) if previous is None else previous
+    previous = before.u if previous is None else previous
     outputs = system.n if observer is None else observer.p
     w = v = belief = None
     if given.noise is not None:

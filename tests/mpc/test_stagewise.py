@@ -330,7 +330,6 @@ def test_float32_and_bad_elements():
     [
         (lambda mpc, s: (replace(mpc, terminal_set=jm.Ellipsoid(np.eye(n), 1.0)), s), "jm.solve"),
         (lambda mpc, s: (replace(mpc, control_horizon=2), s), "jm.solve"),
-        (lambda mpc, s: (replace(mpc, input_rate_limit=1.0), s), "jm.solve"),
         (lambda mpc, s: (mpc, replace(s, A=s.A[:-1])), "A: shape"),
         (lambda mpc, s: (mpc, replace(s, B=s.B[:, :, :, None])), "B"),
         (lambda mpc, s: (mpc, replace(s, c=s.c * np.nan)), "c: holds NaN"),

@@ -30,12 +30,13 @@ from jaxmpc.checks import (
     require_symmetric_psd,
 )
 from jaxmpc.mpc.plan import Aim
-from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.problem import MPC, dynamics_of
 from jaxmpc.mpc.rows import Rows, apply, apply_transposed, at, joined_bounds, spread
-from jaxmpc.mpc.stagewise.stages import Stages
+from jaxmpc.mpc.stagewise.stages import Stages, remembering
 from jaxmpc.pytrees import named_pytree, pytree, static, static_pytree
 from jaxmpc.qp.linalg import matmul, symmetric
 from jaxmpc.qp.problem import Bounds
+from jaxmpc.systems.system import LinearSystem
 
 
 @pytree
@@ -159,8 +160,8 @@ class NonlinearMPC:
 
     e = x − reference, d = u − input_reference.
 
-    mpc: `MPC`, whose `system` is read for its sizes and names only. Not for an Ellipsoid, control
-        horizons and input rates.
+    mpc: `MPC`, whose `system` is read for its sizes and names only. Not for an Ellipsoid or control
+        horizons.
     model: f, a function (x, u) -> x⁺ written in JAX, or an object with such a `step`, and, if it
         has them, `linearize(x, u)` -> LinearSystem and `view(x, u)`, of which tasks are functions.
         A pytree is data of the program (derivatives with respect to its leaves), any other object
@@ -216,6 +217,12 @@ class NonlinearMPC:
         view = getattr(self.model, "view", Point)
         return jnp.atleast_1d(jnp.asarray(task.function(view(x, u)))).astype(x.dtype)
 
+    def remembering(self) -> "NonlinearMPC":
+        """Return the problem with a model of (x_k, u_{k−1}) where `Stages` have that state."""
+        if not self.mpc.input_in_state:
+            return self
+        return replace(self, model=RememberingModel(self.model, self.mpc.system.n))
+
     def values(self, x: Array, u: Array) -> list[Array]:
         """Return what each task's function gives at its steps, (steps, p), along x (N+1, n),
         u (N, m)."""
@@ -225,6 +232,26 @@ class NonlinearMPC:
             each = jax.vmap(lambda x, u, task=task: self.value(task, x, u))
             found.append(each(at(x, steps), at(u, steps)))
         return found
+
+
+@pytree
+class RememberingModel:
+    """A model with the state (x_k, u_{k−1}), of which n numbers are those of the given one."""
+
+    given: Any
+    n: int = static()
+
+    def step(self, x: Array, u: Array) -> Array:
+        """Return the next state."""
+        return jnp.concatenate([self.given.step(x[: self.n], u), u])
+
+    def linearize(self, x: Array, u: Array) -> LinearSystem:
+        """Return the affine model about x, u."""
+        return LinearSystem(*remembering(*linear_model(self.given, x[: self.n], u)))
+
+    def view(self, x: Array, u: Array) -> Any:
+        """Return what tasks are functions of."""
+        return getattr(self.given, "view", Point)(x[: self.n], u)
 
 
 @functools.lru_cache(maxsize=256)
@@ -260,6 +287,8 @@ def total_cost(s: Stages, problem: NonlinearMPC, x: Array, u: Array) -> Array:
     e, d = x - aim.states, u - aim.inputs
     J = jnp.sum(s.stage * (jnp.sum(e[:-1] * apply(s.Q, e[:-1]), 1) + jnp.sum(d * apply(s.R, d), 1)))
     J = J + jnp.sum(e[-1] * matmul(e[-1], s.P.T))
+    if s.cross is not None:
+        J = J + 2 * jnp.sum(s.stage * jnp.sum(d * apply(s.cross, e[:-1]), 1))
     for task, value, target in zip(problem.tasks, problem.values(x, u), aim.targets, strict=True):
         J = J + task_cost(task, value, at(target, task.at(len(u))))
     return J
@@ -273,29 +302,23 @@ def all_rows(s: Stages, problem: NonlinearMPC, x: Array, u: Array) -> Array:
     return jnp.concatenate(found)
 
 
-def linear_models(model: Any, x: Array, u: Array) -> tuple[Array, Array, Array]:
-    """Return A (N, n, n), B (N, n, m), c (N, n) about each step of x (N, n), u (N, m)."""
+def linear_model(model: Any, x: Array, u: Array) -> tuple[Array, Array, Array]:
+    """Return A (n, n), B (n, m), c (n,) of the affine model about x (n,), u (m,)."""
     own = getattr(model, "linearize", None)
     if own is not None:
-        found = jax.vmap(own)(x, u)
-        cast = lambda v: jnp.asarray(v, x.dtype)
-        c = jnp.zeros_like(x) if found.c is None else cast(found.c)
-        return cast(found.A), cast(found.B), c
-
-    def affine(x: Array, u: Array) -> tuple[Array, Array, Array]:
-        moved = lambda x, u: (model.step(x, u),) * 2
-        (A, B), after = jax.jacfwd(moved, argnums=(0, 1), has_aux=True)(x, u)
-        return A, B, after - matmul(A, x) - matmul(B, u)
-
-    return jax.vmap(affine)(x, u)
+        return dynamics_of(own(x, u), x.dtype)
+    moved = lambda x, u: (model.step(x, u),) * 2
+    (A, B), after = jax.jacfwd(moved, argnums=(0, 1), has_aux=True)(x, u)
+    return A, B, after - matmul(A, x) - matmul(B, u)
 
 
 def expanded(s: Stages, problem: NonlinearMPC, x: Array, u: Array) -> Stages:
     """Return the problem about x (N+1, n), u (N, m); s: `Stages` of the MPC."""
     N, dtype = s.horizon, s.P.dtype
-    A, B, c = linear_models(problem.model, x[:-1], u)
+    A, B, c = jax.vmap(lambda x, u: linear_model(problem.model, x, u))(x[:-1], u)
     weights = s.stage[:, None, None]
-    Q, R, P, cross = weights * s.Q, weights * s.R, s.P, None
+    Q, R, P = weights * s.Q, weights * s.R, s.P
+    cross = None if s.cross is None else weights * s.cross
     gx, gu = s.gradient(x, u)
     blocks, bounds = list(s.blocks), [s.bounds]
     for task, target in zip(problem.tasks, s.aim.targets, strict=True):
@@ -375,4 +398,7 @@ def curved(
         blocks = blocks + spread(found, steps, N + 1)
     weights = s.stage[:, None, None] * base.stage[:, None, None]
     Q, R = weights * base.Q + blocks[:-1, :n, :n], weights * base.R + blocks[:-1, n:, n:]
-    return replace(s, Q=Q, R=R, cross=blocks[:-1, n:, :n], P=base.P + blocks[-1, :n, :n])
+    cross = blocks[:-1, n:, :n]
+    if base.cross is not None:
+        cross = cross + weights * base.cross
+    return replace(s, Q=Q, R=R, cross=cross, P=base.P + blocks[-1, :n, :n])

@@ -81,6 +81,7 @@ def solve_stagewise(
     warm_start: Plan | WarmStart | None = None,
     *,
     input_reference: Reals | None = None,
+    previous_input: Reals | None = None,
     scale: ArrayLike | None = None,
 ) -> Plan:
     """Solve an MPC problem stage by stage from the state x0 (n,): what takes the least time where
@@ -89,7 +90,7 @@ def solve_stagewise(
     A (n, n), B (n, m) and c (n,) of mpc.system may have a leading axis N:
     x_{k+1} = A_k x_k + B_k u_k + c_k. `replace(mpc, system=...)` puts a system into a problem.
 
-    x0, references, solver and the Plan are those of `solve`, and so is the status: residuals and
+    x0, references, previous_input, solver and the Plan are those of `solve`, and so is the status: residuals and
     gap of the returned inputs and multipliers, evaluated from the data in float64. What differs:
     no infeasibility is proved (a problem without a solution ends as ITERATION_LIMIT: soften the
     rows that may not hold). Derivatives with respect to every array of data are those of
@@ -106,12 +107,11 @@ def solve_stagewise(
 
     `jax.vmap` over x0, references or the arrays of `mpc`, its system's among them. Raises
     ValueError for bad data that can be read, and for what only `solve` supports: Ellipsoids,
-    control horizons, input rates, disturbances.
+    control horizons, disturbances.
     """
     factor = factor_stages(mpc, solver, scale)
-    return plan_stages(
-        factor, mpc, x0, reference, solver, warm_start, input_reference=input_reference
-    )
+    aim = {"input_reference": input_reference, "previous_input": previous_input}
+    return plan_stages(factor, mpc, x0, reference, solver, warm_start, **aim)
 
 
 def factor_stages(
@@ -137,7 +137,6 @@ def checked(mpc: MPC, solver: ADMM) -> MPC:
     for name, found in (
         ("terminal_set is an Ellipsoid", isinstance(mpc.terminal_set, Ellipsoid)),
         ("control_horizon is given", mpc.control_horizon is not None),
-        ("input rates are limited or weighed", mpc.input_in_state),
         ("disturbance is given", mpc.disturbance is not None),
     ):
         if found:
@@ -268,9 +267,11 @@ def plan_stages(
     warm_start: Plan | WarmStart | None = None,
     *,
     input_reference: Reals | None = None,
+    previous_input: Reals | None = None,
 ) -> Plan:
     """The rest of `solve_stagewise`, for the same mpc and solver; mpc.system is not read."""
-    aim = full_aim(mpc, checked_aim(mpc, x0, reference, input_reference), factor.E.dtype)
+    aim = checked_aim(mpc, x0, reference, input_reference, previous_input)
+    aim = full_aim(mpc, aim, factor.E.dtype)
     if warm_start is not None:
         warm_start = WarmStart.of(warm_start, factor.stages.layout, mpc)
     mpc = replace(mpc, prestabilise=None)
@@ -278,12 +279,13 @@ def plan_stages(
 
 
 def full_aim(mpc: MPC, aim: Aim, dtype: DTypeLike) -> Aim:
-    """Return x0 (n,) and the references at all stages, (N+1, n) and (N, m), in one floating
-    type."""
+    """Return x0 (n,), the references at all stages, (N+1, n) and (N, m), and the previous input
+    (m,), None where nothing depends on it, in one floating type."""
     N, n, m = mpc.horizon, mpc.system.n, mpc.system.m
     spread = lambda v, *shape: jnp.broadcast_to(jnp.asarray(0 if v is None else v, dtype), shape)
     x0 = jnp.asarray(aim.x0, dtype)
-    return Aim(x0, spread(aim.states, N + 1, n), spread(aim.inputs, N, m))
+    before = spread(aim.previous_input, m) if mpc.input_in_state else None
+    return Aim(x0, spread(aim.states, N + 1, n), spread(aim.inputs, N, m), before)
 
 
 @jax.jit
@@ -296,10 +298,11 @@ def _plan(
     aim = jax.tree.map(lambda v: jnp.where(jnp.isfinite(v), v, 0), aim)
     # Only cost and slack are read from the problem as given.
     mpc = jax.tree.map(lambda v: jnp.where(usable, v, 0), mpc)
-    s = replace(factor.stages, aim=aim)
+    s = factor.stages.aimed(aim)
     found = stage_solution(factor, s, solver, warm_start)
     found = replace(found, iterations=jnp.int32(solver.admm_steps()))
-    return answer(mpc, s.layout, found, fault, predict(s, found.z), found.z, aim)
+    x = s.of_system(predict(s, found.z))
+    return answer(mpc, s.layout, found, fault, x, found.z, aim)
 
 
 def stage_solution(

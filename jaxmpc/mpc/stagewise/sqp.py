@@ -85,6 +85,7 @@ def solve_nonlinear(
     warm_start: Plan | WarmStart | None = None,
     *,
     input_reference: Reals | None = None,
+    previous_input: Reals | None = None,
     targets: Sequence[Reals | None] | None = None,
     iterations: int = ITERATIONS,
     hessian: Literal["exact", "gauss-newton"] = "exact",
@@ -92,9 +93,10 @@ def solve_nonlinear(
 ) -> Plan:
     """Solve a nonlinear MPC from the state x0 (n,) by sequential quadratic programming.
 
-    reference (n,) or (N+1, n), input_reference (m,) or (N, m), None for zero. targets: one array
-    for each task, in place of its own. solver: of the QPs, as in `solve_stagewise` (no ADMM steps
-    where solver.iterations is None); its eps is the tolerance of the nonlinear problem.
+    reference (n,) or (N+1, n), input_reference (m,) or (N, m), previous_input u_{−1} (m,), None for
+    zero. targets: one array for each task, in place of its own. solver: of the QPs, as in
+    `solve_stagewise` (no ADMM steps where solver.iterations is None); its eps is the tolerance of
+    the nonlinear problem.
     warm_start: an earlier Plan or a WarmStart; None, or where it costs a hundred times as much: at
     rest at x0 under the first input reference.
     iterations: QPs at most. 1: the real-time iteration, a full step, whose plan, residuals and
@@ -123,7 +125,8 @@ def solve_nonlinear(
     if solver.differentiate != "implicit" and iterations > 1:
         fail("solver.differentiate", f"{solver.differentiate!r}", 'With iterations > 1: "implicit"')
     s = jax.eval_shape(Stages.of, mpc)
-    aim = full_aim(mpc, checked_aim(mpc, x0, reference, input_reference), s.P.dtype)
+    aim = checked_aim(mpc, x0, reference, input_reference, previous_input)
+    aim = full_aim(mpc, aim, s.P.dtype)
     aim = aim._replace(targets=_full_targets(problem, targets, s.P.dtype))
     rows = (*s.layout, *task_layout(problem))
     if warm_start is None:
@@ -167,13 +170,14 @@ def _solve(
     numbers = (aim, [(task.weight, task.rho) for task in problem.tasks])
     fault = jnp.where(all_finite(numbers), fault, jnp.int32(Status.NON_FINITE))
     usable = fault == Status.NOT_RUN
-    base = replace(base, aim=jax.tree.map(lambda v: jnp.where(usable, v, 0), aim))
+    aim = jax.tree.map(lambda v: jnp.where(usable, v, 0), aim)
+    base, mpc, problem = base.aimed(aim), problem.mpc, problem.remembering()
     eps = tolerance(solver, base.P.dtype)
     if eps.dtype != jnp.float64:
         eps = jnp.maximum(eps, SINGLE)
     # What is not finite in a warm start counts as 0.
     x, u, y = (jnp.nan_to_num(v.astype(base.P.dtype), posinf=0, neginf=0) for v in warm_start)
-    x, u, y = within_reason(base, problem, x.at[0].set(base.aim.x0), u, y)
+    x, u, y = within_reason(base, problem, x.at[0].set(aim.x0), u, y)
     count = jnp.int32(1)
     if iterations > 1:
         constants = jax.lax.stop_gradient((base, problem, scale, eps))
@@ -195,26 +199,28 @@ def _solve(
         found = assess(nonlinear_residuals, (s,), u, y, Proof.none(u, y), eps)
     found = replace(found, iterations=jnp.asarray(count, jnp.int32))
     x, u = predict(s, found.z), found.z
-    plan = answer(problem.mpc, s.layout, found, fault, x, u, base.aim)
-    return with_tasks(plan, s, base, problem)
+    plan = answer(mpc, s.layout, found, fault, s.of_system(x), u, aim)
+    return with_tasks(plan, s, base, problem, x)
 
 
 def within_reason(
     base: Stages, problem: NonlinearMPC, x: Array, u: Array, y: Array
 ) -> tuple[Array, Array, Array]:
-    """Return the warm start x, u, y, or rest at x0 where it costs more than anybody plans: 100
-    times what rest does, under the first input reference or under inputs at their limits.
+    """Return the warm start x (N+1, ·) of the system, u, y in the states of the stages, or rest at
+    x0 where it costs more than anybody plans: 100 times what rest does, under the first input
+    reference or under inputs at their limits.
 
     About the plan of a reading that is far off, the expansion would be rounding."""
-    rest_x = jnp.broadcast_to(base.aim.x0, x.shape)
     rest_u = jnp.broadcast_to(base.aim.inputs[:1], u.shape)
     most = rest_u
     if isinstance(problem.mpc.inputs, Box):
         ends = arrays((problem.mpc.inputs.lower, problem.mpc.inputs.upper))
         sizes = jnp.stack([jnp.abs(jnp.asarray(v, u.dtype)) for v in ends])
         most = jnp.max(jnp.where(jnp.isfinite(sizes), sizes, 0.0), axis=0) + jnp.abs(rest_u)
+    still = jnp.broadcast_to(x[:1], x.shape)
+    x, rest_x, most_x = (base.joined(x, u), base.joined(still, rest_u), base.joined(still, most))
     J = lambda x, u: jax.lax.stop_gradient(total_cost(base, problem, x, u))
-    sane = J(x, u) <= 100 * (J(rest_x, rest_u) + J(rest_x, most))
+    sane = J(x, u) <= 100 * (J(rest_x, rest_u) + J(most_x, most))
     return jnp.where(sane, x, rest_x), jnp.where(sane, u, rest_u), jnp.where(sane, y, 0.0)
 
 
@@ -225,11 +231,12 @@ def rows_of(s: Stages, base: Stages, problem: NonlinearMPC, x: Array, u: Array) 
     return all_rows(base, problem, x, u) + (s.rows(*about) - all_rows(base, problem, *about))
 
 
-def with_tasks(plan: Plan, s: Stages, base: Stages, problem: NonlinearMPC) -> Plan:
-    """Return the plan with what tasks add to cost and slack."""
+def with_tasks(plan: Plan, s: Stages, base: Stages, problem: NonlinearMPC, x: Array) -> Plan:
+    """Return the plan, with the states x (N+1, n) of the stages, with what tasks add to cost and
+    slack."""
     if not problem.tasks:
         return plan
-    x, u = plan.states, plan.inputs
+    u = plan.inputs
     rows = rows_of(s, base, problem, x, u)
     J = total_cost(base, problem, x, u) + jnp.sum(s.bounds.cost(rows))
     slack = [plan.slack]

@@ -14,6 +14,11 @@ and the value function ½ x'S x + p'x of the steps after k gives (Rawlings, Mayn
     p = (A + BK)'p⁺ − g_x − K'g_u.
 
 Only p runs backward and only x forward; all else is done for all stages at once.
+
+Where input rates are limited or weighed, the state here is (x_k, u_{k−1}), with x_0 followed by the
+given u_{−1}: A and B get m more rows, u_k = u_k, the rate u_k − u_{k−1} is a row in state and input,
+and its cost Δu'W Δu is a part of Q, R and the cross term. The reference of u_{k−1} is that of u_k,
+so that the difference of both distances is the rate.
 """
 
 from dataclasses import replace
@@ -54,6 +59,7 @@ class Stages:
     (N,): weights of the stages, of all three.
     blocks, bounds: the rows of `rows.blocks`, and what is asked of all of them (rows,). aim: where
     a plan begins and what it tracks, with full references; none of it until it is known.
+    remembers: whether the state is (x_k, u_{k−1}), and n its size.
     """
 
     A: Array
@@ -68,16 +74,43 @@ class Stages:
     horizon: int = static()
     cross: Array | None = None
     aim: Aim = Aim(None)
+    remembers: bool = static(default=False)
 
     @classmethod
     def of(cls, mpc: MPC) -> "Stages":
         """Return the data of `mpc`. Works inside jit, vmap and grad."""
         dtype = floating_dtype(mpc)
         A, B, c = dynamics_of(mpc.system, dtype)
-        Q, R, P, _, stage = weights_of(mpc, dtype)
+        Q, R, P, W, stage = weights_of(mpc, dtype)
         found = blocks(mpc, dtype)
         rows = tuple(Rows(b.kind, b.H, b.D, b.steps, b.box) for b in found)
-        return cls(A, B, c, Q, R, P, stage, rows, bounds_of(found, dtype), mpc.horizon)
+        s = cls(A, B, c, Q, R, P, stage, rows, bounds_of(found, dtype), mpc.horizon)
+        if not mpc.input_in_state:
+            return s
+        if mpc.input_rate_weight is None:
+            W = None
+        elif mpc.stage_weights is not None:  # they are not those of rates
+            W = W / jnp.where(stage > 0, stage, 1.0)[:, None, None]
+        return _with_rates(s, W, [block.rate for block in found])
+
+    def aimed(self, aim: Aim) -> "Stages":
+        """Return the stages with x0 and full references of the problem as it was stated."""
+        if self.remembers:
+            before = jnp.concatenate([aim.inputs, aim.inputs[-1:]])  # the last has no weight
+            states = jnp.concatenate([aim.states, before], axis=1)
+            aim = aim._replace(x0=jnp.concatenate([aim.x0, aim.previous_input]), states=states)
+        return replace(self, aim=aim)
+
+    def joined(self, x: Array, u: Array) -> Array:
+        """Return the states of the stages for those x (N+1, ·) of the system under u (N, m)."""
+        if not self.remembers:
+            return x
+        before = jnp.concatenate([self.aim.x0[None, x.shape[1] :], u])
+        return jnp.concatenate([x, before], axis=1)
+
+    def of_system(self, x: Array) -> Array:
+        """Return the states of the system in those x (N+1, n) of the stages."""
+        return x[:, : x.shape[1] - self.B.shape[-1]] if self.remembers else x
 
     @property
     def layout(self) -> Layout:
@@ -117,6 +150,40 @@ class Stages:
         return [v if v.ndim > dimensions else None for v, dimensions in values]
 
 
+def _padded(M: Array, m: int) -> Array:
+    """Return M (…, a, b) with m rows and columns of zeros behind."""
+    return jnp.pad(M, [*[(0, 0)] * (M.ndim - 2), (0, m), (0, m)])
+
+
+def remembering(A: Array, B: Array, c: Array) -> tuple[Array, Array, Array]:
+    """Return A, B, c of the state (x_k, u_{k−1}); each may have a leading axis."""
+    m = B.shape[-1]
+    identity = jnp.broadcast_to(jnp.eye(m, dtype=B.dtype), (*B.shape[:-2], m, m))
+    c = jnp.pad(c, [*[(0, 0)] * (c.ndim - 1), (0, m)])
+    return _padded(A, m), jnp.concatenate([B, identity], axis=-2), c
+
+
+def _with_rates(s: Stages, W: Array | None, rates: list[bool]) -> Stages:
+    """Return the stages in the state (x_k, u_{k−1}), with the weight W (m, m), or one a step, of
+    input rates; rates: which blocks are rows of them."""
+    A, B, c = remembering(s.A, s.B, s.c)
+    n, m = s.A.shape[-1], s.B.shape[-1]
+    found = []
+    for block, rate in zip(s.blocks, rates, strict=True):
+        if rate:
+            H: Any = jnp.pad(-jnp.eye(m, dtype=s.P.dtype), [(0, 0), (n, 0)])
+        else:
+            H = None if block.H is None else jnp.pad(block.H, [(0, 0), (0, m)])
+        found.append(replace(block, H=H, box=block.box and H is None))
+    Q, R, P, cross = _padded(s.Q, m), s.R, _padded(s.P, m), None
+    if W is not None:
+        each = [(0, 0)] * (W.ndim - 2)
+        Q, R = Q + jnp.pad(W, [*each, (n, 0), (n, 0)]), R + W
+        cross = -jnp.pad(W, [*each, (0, 0), (n, 0)])
+    changed = {"A": A, "B": B, "c": c, "Q": Q, "R": R, "P": P, "cross": cross}
+    return replace(s, **changed, blocks=tuple(found), remembers=True)
+
+
 def cleaned(s: Stages) -> tuple[Stages, Array]:
     """The data with harmless numbers in place of those that are not usable, and the fault in them
     (see `qp.solve.cleaned`): NOT_RUN for none, NON_CONVEX where Q, R or P is indefinite.
@@ -137,13 +204,16 @@ def cleaned(s: Stages) -> tuple[Stages, Array]:
             for test, v, harmless in zip(tests[-2:], (linear, quadratic), (jnp.inf, 0), strict=True)
         )
     lower, upper = jnp.where(ordered, lower, -jnp.inf), jnp.where(ordered, upper, jnp.inf)
-    Q, R, P = finite((s.Q, s.R, s.P))
-    convexity = [convex(Q), convex(R), convex(P)]
+    Q, R, P, cross = finite((s.Q, s.R, s.P, s.cross))
+    sound = lambda M: jnp.all(jax.vmap(convex)(M)) if M.ndim == 3 else convex(M)
+    convexity = [sound(Q), sound(R), sound(P)]
     positive = jnp.isfinite(s.stage) & (s.stage > 0)
     fault = jnp.where(everywhere(*convexity, positive), Status.NOT_RUN, Status.NON_CONVEX)
     fault = jnp.where(everywhere(*tests), fault, Status.NON_FINITE).astype(jnp.int32)
-    others = (jnp.zeros_like(Q), jnp.eye(len(R), dtype=R.dtype), jnp.zeros_like(P))
-    Q, R, P = map(jnp.where, convexity, (Q, R, P), others)
+    identity = jnp.broadcast_to(jnp.eye(R.shape[-1], dtype=R.dtype), R.shape)
+    Q, R, P = map(jnp.where, convexity, (Q, R, P), (jnp.zeros_like(Q), identity, jnp.zeros_like(P)))
+    if cross is not None:
+        cross = jnp.where(everywhere(*convexity), cross, 0.0)
     harmless = replace(
         s,
         A=finite(s.A),
@@ -155,6 +225,7 @@ def cleaned(s: Stages) -> tuple[Stages, Array]:
         stage=jnp.where(positive, s.stage, 1.0),
         blocks=finite(s.blocks),
         bounds=Bounds(lower, upper, linear, quadratic),
+        cross=cross,
     )
     return harmless, fault
 
