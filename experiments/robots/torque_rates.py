@@ -6,7 +6,7 @@ largest violation of limits on positions and velocities; plans solved and plans 
 the error after the run; and the cost Σ (ξ − r)'Q(ξ − r) + (u − s)'R(u − s). Torques are limited by
 the model in all of them.
 
-    python experiments/robots/torque_rates.py --robot arm7 --count 64 --rate 100
+    python experiments/robots/torque_rates.py --robot arm7 --count 64 --rate 300
 """
 
 import time
@@ -29,7 +29,7 @@ class Settings:
     count: int = 64
     seconds: float = 1.5
     horizon: int = 20
-    rate: float = 100.0
+    rate: float = 300.0
     weight: float = 100.0
     spread: float = 0.3
     sqp: int = 10

@@ -29,7 +29,9 @@ def problem(seed):
     """A random problem with limits and weights of rates, and where it starts."""
     rng = np.random.default_rng(seed)
     system = jm.LinearSystem(
-        np.eye(n) + 0.2 * rng.normal(size=(n, n)), rng.normal(size=(n, m)), 0.05 * rng.normal(size=n)
+        np.eye(n) + 0.2 * rng.normal(size=(n, n)),
+        rng.normal(size=(n, m)),
+        0.05 * rng.normal(size=n),
     )
     root = rng.normal(size=(m, m))
     reach = jm.Soft(np.eye(n), -0.5 * np.ones(n), 0.5 * np.ones(n), 5.0, stages=(1, 3, N))
@@ -75,7 +77,9 @@ def test_plans_are_those_of_other_solvers(seed):
     assert jax.tree.structure(plan) == jax.tree.structure(dense)
     for name in ("states", "inputs", "cost", "slack"):
         np.testing.assert_allclose(getattr(plan, name), getattr(dense, name), atol=1e-8)
-    for ours, theirs in zip(*map(jax.tree.leaves, (plan.multipliers, dense.multipliers)), strict=True):
+    for ours, theirs in zip(
+        *map(jax.tree.leaves, (plan.multipliers, dense.multipliers)), strict=True
+    ):
         np.testing.assert_allclose(ours, theirs, atol=1e-7)
     cost, u = by_clarabel(mpc, x0, previous, states, inputs)
     np.testing.assert_allclose(plan.cost, cost, rtol=1e-8)
@@ -170,7 +174,10 @@ def test_loops_of_a_linear_plant_are_those_of_the_dense_controller(linearize):
     limits = jm.Box([-1.5, -2.0], [1.5, 2.0]), jm.Box([-2.0], [2.0])
     plant = jm.LinearPlant(JOINT, *limits)
     mpc = jm.robot_mpc(plant, [100.0, 1.0], [0.01], 20, input_rate_limit=0.3, margin=0.0)
-    start, goal = np.array([-0.4, 0.0]), {"reference": np.array([0.2, 0.0]), "input_reference": [0.1]}
+    start, goal = (
+        np.array([-0.4, 0.0]),
+        {"reference": np.array([0.2, 0.0]), "input_reference": [0.1]},
+    )
     run = partial(jm.simulate, plant=plant, x0=start, steps=60, **goal)
     fixed = run(jm.RobotController(plant, mpc, PRECISE, linearize="set-point"))
     moved = run(jm.RobotController(plant, mpc, PRECISE, linearize=linearize))
