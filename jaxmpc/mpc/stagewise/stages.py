@@ -15,9 +15,9 @@ and the value function ½ x'S x + p'x of the steps after k gives (Rawlings, Mayn
 
 Only p runs backward and only x forward; all else is done for all stages at once.
 
-Where input rates are limited or weighed, the state here is (x_k, u_{k−1}), x_0 followed by the given
-u_{−1}: A and B get m more rows, u_k = u_k, the rate u_k − u_{k−1} is a row in state and input, and
-its cost Δu'W Δu is a part of Q, R and the cross term. The reference of u_{k−1} is that of u_k,
+Where input rates are limited or weighed, the state here is (x_k, u_{k−1}), x_0 followed by u_{−1}:
+A and B get m more rows, u_k = u_k, the rate u_k − u_{k−1} is a row in state and input, and its cost
+Δu'W Δu is a part of Q, R and the cross term. The reference of u_{k−1} is that of u_k,
 so that the difference of both distances is the rate.
 """
 
