@@ -92,8 +92,8 @@ def solve_stagewise(
 
     x0, references, previous_input, solver and the Plan are those of `solve`, and so is the status:
     residuals and gap of the returned inputs and multipliers, evaluated from the data in float64.
-    What differs: no infeasibility is proved (a problem without a solution ends as ITERATION_LIMIT: soften the
-    rows that may not hold). Derivatives with respect to every array of data are those of
+    What differs: no infeasibility is proved (a problem without a solution ends as ITERATION_LIMIT:
+    soften the rows that may not hold). Derivatives with respect to every array of data are those of
     solver.differentiate. warm_start: an earlier Plan or a WarmStart, whose states are not read.
     solver.newton_steps: at most so many, a Riccati recursion each; 5 suffice where ADMM, or the
     warm start, has found the active rows. None: 6, after them an interior point method where they
