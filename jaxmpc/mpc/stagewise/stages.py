@@ -180,8 +180,18 @@ def _with_rates(s: Stages, W: Array | None, rates: list[bool]) -> Stages:
         each = [(0, 0)] * (W.ndim - 2)
         Q, R = Q + jnp.pad(W, [*each, (n, 0), (n, 0)]), R + W
         cross = -jnp.pad(W, [*each, (0, 0), (n, 0)])
-    changed = {"A": A, "B": B, "c": c, "Q": Q, "R": R, "P": P, "cross": cross}
-    return replace(s, **changed, blocks=tuple(found), remembers=True)
+    return replace(
+        s,
+        A=A,
+        B=B,
+        c=c,
+        Q=Q,
+        R=R,
+        P=P,
+        cross=cross,
+        blocks=tuple(found),
+        remembers=True,
+    )
 
 
 def cleaned(s: Stages) -> tuple[Stages, Array]:
