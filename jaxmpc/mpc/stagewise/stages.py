@@ -87,11 +87,10 @@ class Stages:
         s = cls(A, B, c, Q, R, P, stage, rows, bounds_of(found, dtype), mpc.horizon)
         if not mpc.input_in_state:
             return s
-        if mpc.input_rate_weight is None:
-            W = None
-        elif mpc.stage_weights is not None:  # they are not those of rates
+        if mpc.stage_weights is not None:  # they are not those of rates
             W = W / jnp.where(stage > 0, stage, 1.0)[:, None, None]
-        return _with_rates(s, W, [block.rate for block in found])
+        weight = None if mpc.input_rate_weight is None else W
+        return _with_rates(s, weight, [block.rate for block in found])
 
     def aimed(self, aim: Aim) -> "Stages":
         """Return the stages with x0 and full references of the problem as it was stated."""
