@@ -19,6 +19,7 @@ from jaxmpc.export.c_files import CFiles, input_limits, literal
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.plan import WarmStart
 from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.tightening import require_tightened
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.linalg import matmul
 from jaxmpc.qp.status import Status
@@ -59,6 +60,7 @@ def export_c(
     solver = ADMM() if solver is None else solver
     require_kind("mpc", mpc, MPC)
     require_kind("solver", solver, ADMM)
+    require_tightened(mpc, "C code")
     files = CFiles.open(folder, name, dtype, tolerance, TOLERANCE, overwrite)
     with jax.enable_x64(True):
         controller = Controller(mpc, replace(solver, newton_steps=0))

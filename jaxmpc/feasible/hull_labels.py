@@ -238,9 +238,14 @@ def verdict(p: ExactData, hull: Hull, theta: Array) -> proofs.Verdict:
 
 def nearest_cone(hull: Hull, theta: Array) -> tuple[Array, Array]:
     """Return the indices of the cone of θ (d,), and of the half-space that it exceeds most."""
-    length = jnp.linalg.norm(hull.normals, axis=1)
     cone = index_of_largest(hull.gauge, jnp.zeros(len(hull.gauge)), theta - hull.center)
-    return cone, index_of_largest(hull.normals / length[:, None], hull.offsets / length, theta)
+    return cone, exceeded_most(hull, theta)
+
+
+def exceeded_most(hull: Hull, theta: Array) -> Array:
+    """Return the index of the half-space that θ (d,) exceeds most."""
+    length = jnp.linalg.norm(hull.normals, axis=1)
+    return index_of_largest(hull.normals / length[:, None], hull.offsets / length, theta)
 
 
 def index_of_largest(rows: Array, offsets: Array, x: Array) -> Array:

@@ -31,9 +31,9 @@ from jaxmpc.feasible.hull_labels import (
     ROUNDS,
     Hull,
     edges_of,
+    exceeded_most,
     hull_facets,
     largest_row_sum,
-    nearest_cone,
 )
 from jaxmpc.feasible.pipeline import (
     MOST_PROGRAMS,
@@ -227,9 +227,7 @@ class PolicyHull:
 
 def label(hull: Hull, theta: Array) -> tuple[Array, Array, Array]:
     """Return the label of θ (d,), 0 where it is left to a ray, its cone, and its half-space."""
-    cone, facet = nearest_cone(hull, theta)
-    if theta.shape[0] > 2:  # of facets in one plane, that of the cone which holds θ
-        cone = holding_cone(hull, theta)
+    cone, facet = holding_cone(hull, theta), exceeded_most(hull, theta)
     share = jnp.sum(hull.M[cone] * (theta - hull.center), axis=1)
     inside = jnp.all(share >= hull.least[cone]) & (jnp.sum(share) <= hull.most[cone])
     a, b, w = (v[facet] for v in hull.cuts)
@@ -238,7 +236,8 @@ def label(hull: Hull, theta: Array) -> tuple[Array, Array, Array]:
 
 
 def holding_cone(hull: Hull, theta: Array) -> Array:
-    """Return the index of the cone in which the least λ_i of θ is largest. One cone after the
+    """Return the index of the cone in which the least λ_i of θ is largest: of facets in one plane,
+    of which there are many where rays end on one face, that which holds θ. One cone after the
     other, as in `hull_labels.index_of_largest`."""
     x = theta - hull.center
 

@@ -37,13 +37,13 @@ from jaxmpc.checks import fail, require_kind
 from jaxmpc.feasible.hard_constraints import Axes, hard_blocks, make_view
 from jaxmpc.feasible.plan_polytope import PlanPolytope
 from jaxmpc.feasible.problem import FeasibilityProblem, as_box
+from jaxmpc.mpc.policy_rows import require_generators, require_plain_rows, tube_section
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.tightening import feedback_gain, without_disturbance
 from jaxmpc.pytrees import record
-from jaxmpc.sets.convex_sets import Box, Zonotope
+from jaxmpc.sets.convex_sets import Box
 from jaxmpc.sets.disturbances import disturbance_columns
 from jaxmpc.sets.lp import Program, power_of_two
-from jaxmpc.sets.minimal_invariant import minimal_robust_invariant_set
 from jaxmpc.systems.system import host_matrices
 
 # Bits of the numbers whose sums are computed exactly, relative to the largest of an array.
@@ -91,11 +91,7 @@ class PolicyProblem(FeasibilityProblem):
         mpc.validate()
         boxes = {name: as_box(getattr(mpc, name)) for name in ("states", "inputs", "terminal_set")}
         hard = replace(mpc, soft=(), input_rate_weight=None, **boxes)
-        cure = 'Leave it out, or give policy="tightened"'
-        if hard.control_horizon is not None:
-            fail("control_horizon", f"given with policy {hard.policy!r}", cure)
-        if hard.rate_limited:
-            fail("input_rate_limit", f"given with policy {hard.policy!r}", cure)
+        require_plain_rows(hard)
         inputs = hard.inputs
         if not isinstance(inputs, Box) or not np.isfinite(inputs.bounds()).all():
             fail("inputs", "are in no bounded Box, which proofs of this policy need", "Give one")
@@ -177,9 +173,7 @@ def directions(mpc: MPC) -> tuple[np.ndarray, np.ndarray]:
         lower, upper = exactly(W.lower), exactly(W.upper)
         half = (upper - lower) / 2
         return (lower + upper) / 2, np.diag(half)[:, half > 0]
-    if not isinstance(W, Zonotope):
-        what = f"is a {type(W).__name__}, and affine policies answer to generators"
-        fail("disturbance", what, 'Give a Box or a Zonotope, or policy="tightened"')
+    require_generators(W)
     center, G = np.asarray(W.center, float), np.asarray(W.generators, float)
     if np.linalg.matrix_rank(G) < G.shape[1]:
         what = "has generators that depend on each other, to which no policy can answer one by one"
@@ -203,10 +197,7 @@ def affine_fractions(mpc: MPC, view: Any) -> PolicyRows:
 def tube_fractions(mpc: MPC, view: Any) -> PolicyRows:
     """Return the rows of a tube, over θ and (v, ζ), all products of the data exact."""
     n, m, N = mpc.system.n, mpc.system.m, mpc.horizon
-    gain = np.asarray(feedback_gain(mpc), float)
-    plant, W = replace(mpc.system, c=None), mpc.disturbance
-    found = minimal_robust_invariant_set(plant, gain, W, disturbance_matrix=mpc.disturbance_matrix)
-    section = found.to_zonotope()
+    gain, section = np.asarray(feedback_gain(mpc), float), tube_section(mpc)
     center, generators = exactly(section.center), exactly(section.generators)
     count = generators.shape[1]
     nominal = condensed_fractions(mpc, view, 0 * center, zeros(n, 0))

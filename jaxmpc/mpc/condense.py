@@ -24,7 +24,7 @@ from jaxmpc.arrays import host_array
 from jaxmpc.checks import concrete, require_memory
 from jaxmpc.mpc.problem import MPC, Switch, Weights, dynamics_of, weights_of
 from jaxmpc.mpc.rows import Layout, blocks, bounds_of, layout_of, split, stacked
-from jaxmpc.mpc.tightening import require_room, with_gain
+from jaxmpc.mpc.tightening import require_room, require_tightened, with_gain
 from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.jax_transformations import compiled_lightly, own_modes, varying
 from jaxmpc.qp.linalg import arrays, floating_dtype, matmul, solve
@@ -170,6 +170,7 @@ def condense(mpc: MPC) -> Condensed:
     sizes = mpc.horizon, mpc.system.n, mpc.system.m, mpc.control_horizon, a_step
     needed = condensed_bytes(*sizes) * jax.dtypes.canonicalize_dtype(float).itemsize / 8
     require_memory("horizon", needed, "Give fewer steps, or use jm.mpc.solve_stagewise")
+    require_tightened(mpc, "a plan of one sequence of inputs")
     mpc = filled_in(mpc)
     if mpc.disturbance is not None and concrete(mpc):
         require_room(mpc, blocks(mpc, float))

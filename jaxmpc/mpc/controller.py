@@ -28,7 +28,7 @@ from jax import Array
 
 from jaxmpc.arrays import Reals, all_finite
 from jaxmpc.checks import concrete, fail, require_kind
-from jaxmpc.mpc.condense import Condensed, condense
+from jaxmpc.mpc.condense import Condensed
 from jaxmpc.mpc.plan import (
     Aim,
     Control,
@@ -43,8 +43,9 @@ from jaxmpc.mpc.plan import (
     require_warm_start,
     sorted_multipliers,
 )
+from jaxmpc.mpc.policy_rows import PolicyCondensed, condensed_plan
 from jaxmpc.mpc.problem import MPC, dynamics_of
-from jaxmpc.mpc.rows import apply, blocks, dynamics_terms, split
+from jaxmpc.mpc.rows import apply, blocks, dynamics_terms, given_blocks, split
 from jaxmpc.mpc.tightening import with_gain
 from jaxmpc.pytrees import prepared_pytree
 from jaxmpc.qp.admm import ADMM, DEFAULT, Factor, factorise
@@ -94,7 +95,7 @@ class Controller:
         require_kind("solver", self.solver, ADMM)
         self.solver.validate()
         mpc, finite = harmless(with_gain(self.mpc))
-        condensed = condense(mpc)
+        condensed = condensed_plan(mpc)
         # The factorization reads from P what is wrong with the data.
         condensed = replace(condensed, P=jnp.where(finite, condensed.P, jnp.nan))
         self.solver.validate(condensed.C.shape[0])
@@ -195,7 +196,8 @@ class Controller:
         return self._in_two_parts(program, checked, warm_start)
 
     def _in_two_parts(self, program: Callable[..., T], *given: Any, **status: Any) -> T:
-        hard = not has_dual_steps(self.condensed.balls, self.condensed.C)
+        c = self.condensed
+        hard = isinstance(c, PolicyCondensed) or not has_dual_steps(c.balls, c.C)
         return in_two_parts(program, hard, self.solver, self, *given, **status)
 
     def _checked(self, x0: Reals, *aim: Reals | None) -> Aim:
@@ -299,7 +301,9 @@ def planned_from(controller: Controller, aim: Aim, start: WarmStart | None, *, w
         )
         theta = jnp.concatenate([theta, aim.previous_input])
     qp = _qp(controller, theta, aim)
-    pair = None if start is None else (c.variables(start.states, start.inputs), start.multipliers)
+    pair = None
+    if start is not None and not isinstance(c, PolicyCondensed):
+        pair = c.variables(start.states, start.inputs), start.multipliers
     found, fault = solve_factored(qp, controller.factor, controller.solver, pair, whole=whole)
     fault = jnp.where(finite, fault, Status.NON_FINITE)
     return planned(controller, theta, aim, found, fault)
@@ -321,9 +325,11 @@ def _qp(controller: Controller, theta: Array, aim: Aim) -> QP:
         return c.qp(theta, aim.states, aim.inputs)
     x, u = c.response(mpc.system, aim.forecast)
     rates = jnp.diff(u, axis=0, prepend=jnp.zeros_like(u[:1]))
-    along = [b.values(x, rates if b.rate else u).ravel() for b in blocks(mpc, x.dtype)]
+    along = [b.values(x, rates if b.rate else u).ravel() for b in given_blocks(mpc, x.dtype)]
+    shift = jnp.concatenate([*along, x[0, :0]])
     states, inputs = (0.0 if r is None else r for r in (aim.states, aim.inputs))
-    qp = c.qp(theta, states - x, inputs - u, jnp.concatenate([*along, x[0, :0]]))
+    shift = c.of_all(shift) if isinstance(c, PolicyCondensed) else shift
+    qp = c.qp(theta, states - x, inputs - u, shift)
     if mpc.input_rate_weight is None:
         return qp
     push = _of_rates(2 * matmul(rates, c.weights.W))
@@ -342,12 +348,17 @@ def planned(
     the problem as stated; fault: the status that faulty data give, NOT_RUN for none.
 
     In float32 the status is that of the QP, which speaks of the plan before it was rounded; rows
-    and dynamics are checked to the precision that is left.
+    and dynamics are checked to the precision that is left. Under affine policies and tubes, which
+    the plan alone does not show, it is that of the QP.
     """
-    states, inputs = controller.condensed.trajectory(theta, found.z)
+    mpc, c = controller.mpc, controller.condensed
+    states, inputs = c.trajectory(theta, found.z)
     if aim.forecast is not None:
-        more = controller.condensed.response(controller.mpc.system, aim.forecast)
+        more = c.response(mpc.system, aim.forecast)
         states, inputs = states + more[0], inputs + more[1]
+    if isinstance(c, PolicyCondensed):
+        feedback, found = c.feedback(found.z), replace(found, y=c.of_plan(found.y))
+        return answer(mpc, c.layout, found, fault, states, inputs, aim, feedback)
     terms = stated_terms(*jax.lax.stop_gradient((controller, found.y, states, inputs, aim)))
     eps, dtype = jnp.asarray(controller.solver.eps, states.dtype), states.dtype
     if dtype == jnp.float64:
@@ -361,7 +372,7 @@ def planned(
         solved = (found.status == Status.SOLVED) & (worst(terms[:1], allowed)[1][0] <= allowed)
     lost = jnp.where(found.status == Status.SOLVED, Status.INACCURATE, found.status)
     found = replace(found, status=jnp.where(solved, Status.SOLVED, lost).astype(jnp.int32))
-    return answer(controller.mpc, controller.condensed.layout, found, fault, states, inputs, aim)
+    return answer(mpc, c.layout, found, fault, states, inputs, aim)
 
 
 def stated_terms(controller: Controller, y: Array, x: Array, u: Array, aim: Aim) -> Terms:

@@ -15,7 +15,7 @@ from jax import Array
 from jaxmpc.arrays import Reals, as_array, host_array
 from jaxmpc.checks import fail
 from jaxmpc.mpc.problem import MPC, weights_of
-from jaxmpc.mpc.rows import Block, Layout, blocks, layout, row_count, row_table, split
+from jaxmpc.mpc.rows import Block, Layout, blocks, given_blocks, layout, row_count, row_table, split
 from jaxmpc.pytrees import named_pytree, pytree
 from jaxmpc.qp.linalg import arrays, matmul
 from jaxmpc.qp.problem import QPSolution
@@ -154,6 +154,9 @@ class Plan(WithStatus):
     from a state without a feasible plan the inputs too may lie outside their limits. The first one
     clipped into them is what `Controller(mpc)(x)` gives.
     A plan serves as warm start.
+    feedback (N, m, N, p): of affine policies, what later inputs add to the plan's, which is that of
+    the undisturbed plant: u_k = inputs_k + Σ_{j<k} feedback_kj w_j; None for other problems. In
+    those with a gain K u_k = inputs_k + K (x_k − states_k).
     """
 
     states: Array
@@ -166,6 +169,7 @@ class Plan(WithStatus):
     dual_residual: Array
     gap: Array
     iterations: Array
+    feedback: Any = None
 
 
 @named_pytree
@@ -256,10 +260,17 @@ def anchored(start: WarmStart, x0: Array) -> WarmStart:
 
 
 def answer(
-    mpc: MPC, layout: Layout, found: QPSolution, fault: Array, x: Array, u: Array, aim: Aim
+    mpc: MPC,
+    layout: Layout,
+    found: QPSolution,
+    fault: Array,
+    x: Array,
+    u: Array,
+    aim: Aim,
+    feedback: Array | None = None,
 ) -> Plan:
-    """Return the plan of a QP's solution, states x (N+1, n) and inputs u (N, m): NaN and the status
-    `fault` where the data had one."""
+    """Return the plan of a QP's solution, states x (N+1, n), inputs u (N, m) and the feedback of
+    affine policies: NaN and the status `fault` where the data had one."""
     solution = with_fault(replace(found, cost=cost(mpc, x, u, aim)), fault)
     nan = lambda v: jnp.where(fault == Status.NOT_RUN, v, jnp.nan)
     return Plan(
@@ -273,6 +284,7 @@ def answer(
         dual_residual=solution.dual_residual,
         gap=solution.gap,
         iterations=solution.iterations,
+        feedback=None if feedback is None else nan(feedback),
     )
 
 
@@ -459,7 +471,7 @@ def soft_columns(mpc: MPC) -> list[int | None]:
     """Column of `Plan.slack` for each row of the condensed QP, None for hard ones."""
     columns: list[int | None] = []
     first = 0
-    for b in blocks(mpc, float):
+    for b in given_blocks(mpc, float):
         hard = b.linear is None
         columns += [None if hard else first + j for _ in b.steps for j in range(b.size)]
         first += 0 if hard else b.size

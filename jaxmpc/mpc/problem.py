@@ -197,8 +197,9 @@ class MPC:
     Plans, costs and multipliers are those of z and v, whose rows are tightened by what the
     disturbance can do (`tightening.py`). "affine": u_k = v_k + Σ_{j<k} M_kj w_j, of which these are
     a part; it has the largest feasible set. "tube": u_k = v_k + K (x_k − z_k) with z_0 anywhere in
-    x_0 − S, S the minimal robust invariant set under K. These two are for maps, boundaries and
-    polytopes of feasible sets. Labels of feasible sets are claims about the policy.
+    x_0 − S, S the minimal robust invariant set under K. Plans of these two are those of the
+    undisturbed plant under the policy, from x_0, and so are their costs (`policy_rows.py`). Labels
+    of feasible sets are claims about the policy.
     """
 
     system: LinearSystem

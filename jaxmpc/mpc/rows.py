@@ -270,7 +270,7 @@ def row_table(mpc: MPC) -> tuple[Row, ...]:
     mpc.validate()
     return tuple(
         Row(b.kind, k, b.names[i], b.units[i], i, b.linear is not None)
-        for b in blocks(mpc, float)
+        for b in given_blocks(mpc, float)
         for k in b.steps
         for i in range(b.size)
     )
@@ -312,7 +312,7 @@ def _each(H: Array, M: Array) -> Array:
 
 def layout(mpc: MPC) -> Layout:
     """Return (kind, steps, rows a step) of each block of rows."""
-    return layout_of(blocks(mpc, float))
+    return layout_of(given_blocks(mpc, float))
 
 
 def layout_of(found: Iterable[Rows]) -> Layout:

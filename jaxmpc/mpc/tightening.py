@@ -52,12 +52,15 @@ def feedback_gain(mpc: MPC) -> Any:
 
 
 def with_gain(mpc: MPC) -> MPC:
-    """Return the problem with its gain filled in, and a Polytope of disturbances as its vertices:
-    what programs of JAX can take as an argument. A nominal problem is returned as it is."""
-    if mpc.disturbance is None:
+    """Return the problem with its gain filled in, and where rows are tightened a Polytope of
+    disturbances as its vertices: what programs of JAX can take as an argument. A nominal problem
+    is returned as it is, and one of affine policies, which have no gain."""
+    if mpc.disturbance is None or mpc.policy == "affine":
         return mpc
-    require_tightened(mpc, "a plan of one sequence of inputs")
-    return replace(mpc, gain=feedback_gain(mpc), disturbance=with_vertices(mpc.disturbance))
+    mpc = replace(mpc, gain=feedback_gain(mpc))
+    if mpc.policy == "tightened":
+        mpc = replace(mpc, disturbance=with_vertices(mpc.disturbance))
+    return mpc
 
 
 def without_disturbance(mpc: MPC) -> MPC:
@@ -68,7 +71,7 @@ def without_disturbance(mpc: MPC) -> MPC:
 def require_tightened(mpc: MPC, what: str) -> None:
     """Raise ValueError for a robust problem of another policy than "tightened"."""
     if mpc.disturbance is not None and mpc.policy != "tightened":
-        cure = 'Give policy="tightened"; map_feasible_set, boundary and feasible_polytope take all'
+        cure = 'Give policy="tightened"; solve, Controller and maps of feasible sets take all'
         fail("policy", f"{mpc.policy!r}: {what} knows no such policy", cure)
 
 

@@ -218,14 +218,12 @@ def test_refusals(fields, message):
 def test_what_takes_one_sequence_refuses_affine_policies():
     mpc = double()
     for call in (
-        lambda: jm.solve(mpc, np.zeros(2)),
-        lambda: jm.Controller(mpc),
-        lambda: jm.solve_many(mpc, np.zeros((1, 2))),
+        lambda: jm.mpc.equilibrium(mpc, np.zeros(2)),
+        lambda: jm.export.export_c(mpc, "nowhere"),
         lambda: jm.explicit.critical_regions(mpc),
         lambda: jm.explicit.exact_penalty(mpc),
         lambda: jm.feasible.feasible_fraction(mpc, np.zeros((1, 2))),
         lambda: jm.feasible.sweep_into("nowhere", mpc, [np.zeros(2)] * 2),
-        lambda: jm.mpc.row_table(mpc),
     ):
         with pytest.raises(ValueError, match="policy: 'affine'"):
             call()

@@ -1,0 +1,295 @@
+"""The condensed QP of plans under affine policies and tubes.
+
+The plan is that of the undisturbed plant: x_{k+1} = A x_k + B u_k + c from x_0, its cost that of
+every other plan. What later inputs do about disturbances are more variables of the same QP, which
+move rows alone.
+
+*Affine policies*: u_k + Σ_{j<k} M_kj w_j (Goulart, Kerrigan & Maciejowski 2006, Automatica 42). A
+row F θ + G v + (D + G M) w of all w = (w_0, w_1, …), with w_j = center + Γ ω_j and |ω_j| ≤ 1,
+keeps its limits for all of them if and only if with T ≥ |(D + G M) Γ|, entry by entry,
+
+    F θ + G v + (D + G M) center + Σ T ≤ upper,    F θ + G v + (D + G M) center − Σ T ≥ lower.
+
+The QP has the variables (v, M, T); its rows are those of the upper bounds, those of the lower ones
+and then −T ≤ (D + G M) Γ ≤ T. Entries that no policy moves need no T.
+
+*Tubes* (Mayne, Seron & Raković 2005, Automatica 41): u = v + K (x − z) with a nominal trajectory z
+that begins anywhere in x_0 − S, S = center + {G ζ : |ζ_i| ≤ 1} a robust invariant set under K. The
+rows of (z, v) are tightened by S. Without disturbances x_k = z_k + A_K^k (x_0 − z_0), so that the
+rows of the plan lose what x_0 − z_0 does to them under u = K x: linear in ζ. The variables of the
+QP are those of the plan and ζ, its rows those of the plan and |ζ_i| ≤ 1.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.typing import DTypeLike
+
+from jaxmpc.checks import concrete, fail, require_memory
+from jaxmpc.mpc.condense import Condensed, condense
+from jaxmpc.mpc.problem import MPC, dynamics_of
+from jaxmpc.mpc.rows import Block, given_blocks, row_count
+from jaxmpc.mpc.tightening import feedback_gain, require_room, without_disturbance
+from jaxmpc.pytrees import pytree, static
+from jaxmpc.qp.jax_transformations import compiled_lightly, own_modes
+from jaxmpc.qp.linalg import arrays, matmul
+from jaxmpc.sets.convex_sets import Box, Zonotope
+from jaxmpc.sets.minimal_invariant import minimal_robust_invariant_set
+
+# Numbers that the solver holds for each of (rows + variables)², about.
+MATRICES = 4
+
+
+@pytree
+class PolicyCondensed(Condensed):
+    """The condensed QP with the variables of a policy behind those of the plan.
+
+    `layout` is that of the plan's rows; these stand `copies` times at the beginning of C. response:
+    (N, m, N p), what inputs do about disturbances before any M; None for tubes.
+    """
+
+    response_to_disturbances: Any
+    copies: int = static()
+
+    def reach(self, reach: Array) -> Array:
+        """Return how far rows move along a unit of length (rows,), as it is."""
+        return reach
+
+    def of_plan(self, y: Array) -> Array:
+        """Return the multipliers of the plan's rows from those of all rows: of two sides the
+        sum."""
+        count = row_count(self.layout)
+        return jnp.sum(y[: self.copies * count].reshape(self.copies, count), axis=0)
+
+    def of_all(self, shift: Array) -> Array:
+        """Return what is added to all rows where `shift` is added to the plan's."""
+        along = jnp.tile(shift, self.copies)
+        return jnp.pad(along, (0, len(self.C) - len(along)))
+
+    def feedback(self, z: Array) -> Array | None:
+        """Return M (N, m, N, p) of a solution z, None for tubes."""
+        base = self.response_to_disturbances
+        if base is None:
+            return None
+        N, m, Np = base.shape
+        entries = causal_entries(N, m, Np // N)
+        M = (
+            jnp.zeros((N * m, Np), z.dtype)
+            .at[tuple(entries.T)]
+            .set(z[N * m : N * m + len(entries)])
+        )
+        found = base + matmul(self.Omega[..., : N * m], M)
+        return found.reshape(N, m, N, Np // N)
+
+
+def condensed_plan(mpc: MPC) -> Condensed:
+    """Return the parametric QP of plans of `mpc`, whatever its policy. Raises ValueError where it
+    does not fit into memory, and for what plans of the policy are not computed with."""
+    if mpc.disturbance is None or mpc.policy == "tightened":
+        return condense(mpc)
+    require_plain_rows(mpc)
+    if mpc.soft:
+        cure = 'Leave them out, or give policy="tightened"'
+        fail("soft", f"rows given with policy {mpc.policy!r}", cure)
+    found = given_blocks(mpc, float)
+    if mpc.policy == "affine":
+        require_generators(mpc.disturbance)
+        require_memory("horizon", affine_bytes(mpc, found), "Give fewer steps, or another policy")
+        return _affine(*arrays((condense(without_disturbance(mpc)), mpc)))
+    section, gain = tube_section(mpc), np.asarray(feedback_gain(mpc), float)
+    sides = tightened_by(section, found, gain)
+    steps = [len(b.steps) for b in found]
+    spread = lambda v, k: np.tile(np.asarray(v), (k, 1))
+    placed = [
+        replace(b, lower=spread(low, k), upper=spread(high, k))
+        for b, (low, high), k in zip(found, sides, steps, strict=True)
+    ]
+    require_room(mpc, placed)
+    nominal = condense(without_disturbance(mpc))
+    return _tube(*arrays((nominal, mpc, gain, section)))
+
+
+def require_plain_rows(mpc: MPC) -> None:
+    """Raise ValueError for rows and moves that affine policies and tubes do not know."""
+    for name in ("control_horizon", "input_rate_limit"):
+        if getattr(mpc, name) is not None:
+            cure = 'Leave it out, or give policy="tightened"'
+            fail(name, f"given with policy {mpc.policy!r}", cure)
+
+
+def require_generators(W: Any) -> None:
+    """Raise ValueError unless affine policies can answer to the disturbances of a set."""
+    if not isinstance(W, Box | Zonotope):
+        what = f"is a {type(W).__name__}, and affine policies answer to generators"
+        fail("disturbance", what, 'Give a Box or a Zonotope, or policy="tightened"')
+
+
+def tube_section(mpc: MPC) -> Zonotope:
+    """Return the cross-section S of a tube. Raises ValueError where dynamics, gain or disturbances
+    are traced, and as `minimal_robust_invariant_set`."""
+    if not concrete(mpc.system, mpc.disturbance, mpc.disturbance_matrix, mpc.gain):
+        cure = "Make a Controller outside of jit and grad and give it as an argument"
+        fail("policy", "'tube' beside traced dynamics, gain or disturbances", cure)
+    gain, plant = np.asarray(feedback_gain(mpc), float), replace(mpc.system, c=None)
+    found = minimal_robust_invariant_set(
+        plant, gain, mpc.disturbance, disturbance_matrix=mpc.disturbance_matrix
+    )
+    return found.to_zonotope()
+
+
+def causal_entries(N: int, m: int, p: int) -> np.ndarray:
+    """Return the places (L, 2) of the entries of M (N m, N p) that answer to earlier
+    disturbances."""
+    return np.argwhere(np.kron(np.tril(np.ones((N, N)), -1), np.ones((m, p))) > 0)
+
+
+def affine_bytes(mpc: MPC, found: Sequence[Block]) -> float:
+    """Return about how many bytes the QP of affine policies takes in float64."""
+    N, m, p = mpc.horizon, mpc.system.m, mpc.disturbances
+    step, moved = _row_steps(found)
+    W: Any = mpc.disturbance
+    generators = p if isinstance(W, Box) else np.shape(W.generators)[1]
+    T = int(np.sum(np.maximum(step - ~moved, 0))) * generators
+    variables = N * m + len(causal_entries(N, m, p)) + T
+    return 8.0 * MATRICES * (2 * len(step) + 2 * T + variables) ** 2
+
+
+def _row_steps(found: Sequence[Block]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the step k of each row, and whether the input of that step moves it (rows,)."""
+    step = np.concatenate([np.zeros(0, int), *(np.repeat(b.steps, b.size) for b in found)])
+    moved = [np.full(len(b.steps) * b.size, b.D is not None) for b in found]
+    return step.astype(int), np.concatenate([np.zeros(0, bool), *moved])
+
+
+def _values(found: Sequence[Block], x: Array, u: Array) -> Array:
+    """Return the rows (rows,) of states x (N+1, n) and inputs u (N, m)."""
+    return jnp.concatenate([b.values(x, u).ravel() for b in found] + [x[0, :0]])
+
+
+def generator_form(W: Any, dtype: DTypeLike) -> tuple[Array, Array]:
+    """Return center (p,) and Γ (p, g) of w = center + Γ ω, |ω_i| ≤ 1."""
+    if isinstance(W, Box):
+        lower, upper = (jnp.asarray(v, dtype) for v in (W.lower, W.upper))
+        return (lower + upper) / 2, jnp.diag((upper - lower) / 2)
+    return jnp.asarray(W.center, dtype), jnp.asarray(W.generators, dtype)
+
+
+@compiled_lightly(0)
+@own_modes
+def _affine(nominal: Condensed, mpc: MPC) -> PolicyCondensed:
+    dtype, N, n, m = nominal.P.dtype, mpc.horizon, mpc.system.n, mpc.system.m
+    center, Gamma = generator_form(mpc.disturbance, dtype)
+    p, g = Gamma.shape
+    E = jnp.eye(n, dtype=dtype)
+    if mpc.disturbance_matrix is not None:
+        E = jnp.asarray(mpc.disturbance_matrix, dtype)
+    found = given_blocks(mpc, dtype)
+    # Row (j, q): what w_j = e_q alone adds.
+    pushes = jnp.einsum("jk,nq->jqkn", jnp.eye(N, dtype=dtype), E).reshape(N * p, N, n)
+    x, u = jax.vmap(lambda e: nominal.response(mpc.system, e))(pushes)
+    D = jax.vmap(lambda x, u: _values(found, x, u))(x, u).T.reshape(-1, N, p)
+    G = nominal.C
+
+    step, moved = _row_steps(found)
+    last = step - ~moved  # the first j whose w_j no earlier input of the row answers to
+    j = np.arange(N)
+    row, at, generator = np.nonzero(
+        np.broadcast_to((j < last[:, None])[..., None], (*D.shape[:2], g))
+    )
+    places = causal_entries(N, m, p)
+    inputs, disturbed, coordinate = places[:, 0], places[:, 1] // p, places[:, 1] % p
+
+    reach = matmul(D, Gamma)
+    fixed = (j == last[:, None]) & ~moved[:, None]
+    constant = jnp.sum(jnp.where(fixed[..., None], jnp.abs(reach), 0.0), axis=(1, 2))
+    middle = jnp.sum(matmul(D, center), axis=1)
+    of_M = G[:, inputs]
+    answers = of_M[row] * Gamma[coordinate][:, generator].T * (at[:, None] == disturbed)
+    sums = jnp.asarray(row == np.arange(len(step))[:, None], dtype)
+    one = jnp.eye(len(row), dtype=dtype)
+    none = jnp.zeros((len(row), G.shape[1]), dtype)
+    value = jnp.concatenate([G, of_M * center[coordinate]], axis=1)
+    answers = jnp.concatenate([none, answers], axis=1)
+    free, zero = jnp.full(len(step), jnp.inf, dtype), jnp.zeros(len(row), dtype)
+    d = nominal.d + middle
+    return _widened(
+        nominal,
+        C=jnp.block([[value, sums], [value, -sums], [answers, -one], [answers, one]]),
+        d=jnp.concatenate([d + constant, d - constant, *2 * [reach[row, at, generator]]]),
+        lower=jnp.concatenate([-free, nominal.lower, zero - jnp.inf, zero]),
+        upper=jnp.concatenate([nominal.upper, free, zero, zero + jnp.inf]),
+        response=u.reshape(N * p, N, m).transpose(1, 2, 0),
+        copies=2,
+    )
+
+
+def tightened_by(section: Zonotope, found: Sequence[Block], gain: Any) -> list[tuple[Any, Any]]:
+    """Return the bounds of each block that are left to the nominal trajectory of a tube."""
+    sides = []
+    for b in found:
+        along: Any = 0.0 if b.H is None else b.H
+        along = along if b.D is None else along + matmul(b.D, gain)
+        middle = matmul(along, jnp.asarray(section.center, along.dtype))
+        half = jnp.sum(jnp.abs(matmul(along, jnp.asarray(section.generators, along.dtype))), axis=1)
+        sides.append((b.lower - middle + half, b.upper - middle - half))
+    return sides
+
+
+@compiled_lightly(0)
+@own_modes
+def _tube(nominal: Condensed, mpc: MPC, gain: Array, section: Zonotope) -> PolicyCondensed:
+    dtype = nominal.P.dtype
+    A, B, _ = dynamics_of(mpc.system, dtype)
+    K = jnp.asarray(gain, dtype)
+    found, closed = given_blocks(mpc, dtype), A + matmul(B, K)
+
+    def along(e: Array) -> Array:
+        _, x = jax.lax.scan(lambda e, _: (matmul(closed, e), e), e, length=mpc.horizon + 1)
+        return _values(found, x, matmul(x[:-1], K.T))
+
+    center, generators = (jnp.asarray(v, dtype) for v in (section.center, section.generators))
+    moves = jax.vmap(along)(generators.T).T
+    bounds = [
+        (jnp.tile(low, len(b.steps)), jnp.tile(high, len(b.steps)))
+        for b, (low, high) in zip(found, tightened_by(section, found, K), strict=True)
+    ]
+    lower, upper = (jnp.concatenate([*side, center[:0]]) for side in zip(*bounds, strict=True))
+    count = generators.shape[1]
+    one, zero = jnp.eye(count, dtype=dtype), jnp.zeros((count, nominal.C.shape[1]), dtype)
+    return _widened(
+        nominal,
+        C=jnp.block([[nominal.C, -moves], [zero, one]]),
+        d=jnp.concatenate([nominal.d - along(center), jnp.zeros(count, dtype)]),
+        lower=jnp.concatenate([lower, -jnp.ones(count, dtype)]),
+        upper=jnp.concatenate([upper, jnp.ones(count, dtype)]),
+        response=None,
+        copies=1,
+    )
+
+
+def _widened(
+    nominal: Condensed, C: Array, d: Array, lower: Array, upper: Array, response: Any, copies: int
+) -> PolicyCondensed:
+    """Return the QP with these rows and as many variables, of which the first are the plan's."""
+    more = C.shape[1] - nominal.C.shape[1]
+    wider = lambda v: jnp.pad(v, [*[(0, 0)] * (v.ndim - 1), (0, more)])
+    D = jnp.tile(nominal.D, (copies, 1))
+    made = replace(
+        nominal,
+        Gamma=wider(nominal.Gamma),
+        Omega=wider(nominal.Omega),
+        P=jnp.pad(nominal.P, (0, more)),
+        F=jnp.pad(nominal.F, [(0, more), (0, 0)]),
+        f=wider(nominal.f),
+        C=C,
+        D=jnp.pad(D, [(0, len(C) - len(D)), (0, 0)]),
+        d=d,
+        lower=lower,
+        upper=upper,
+    )
+    return PolicyCondensed(**vars(made), response_to_disturbances=response, copies=copies)
