@@ -35,7 +35,7 @@ from jaxmpc.feasible import proofs
 from jaxmpc.feasible.condensed_rows import ConstraintRows
 from jaxmpc.feasible.hard_constraints import ExactData
 from jaxmpc.feasible.problem import FeasibilityProblem
-from jaxmpc.feasible.rays import Rays, close_gap, filled
+from jaxmpc.feasible.rays import closed_bounds, filled
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.jax_transformations import own_modes
 
@@ -46,7 +46,7 @@ MOST_COORDINATES = 4
 GAP, USEFUL, ROUNDS, MOST_RAYS = 1e-9, 0.05, 8, 200
 # Points of two coordinates that take longer by the other stages, on a CPU, than the rays do; each
 # further coordinate takes four times as many.
-MANY = 2**18
+MANY = 2**14
 
 
 @pytree
@@ -78,8 +78,7 @@ class Hull:
         if d > MOST_COORDINATES:
             return None
         try:
-            rays = Rays.of(problem)
-            proved, gap = close_gap(rays, GAP, ROUNDS, MOST_RAYS)
+            rays, proved, gap = closed_bounds(problem, GAP, ROUNDS, MOST_RAYS)
         except ValueError:
             return None
         if not gap <= USEFUL:

@@ -19,7 +19,7 @@ from jaxmpc.feasible.pipeline import Labels, OnDemand, Scope, labelled_parts
 from jaxmpc.feasible.policy_hull import policy_hull, policy_labels
 from jaxmpc.feasible.policy_problem import PolicyProblem, problem_of
 from jaxmpc.feasible.problem import FeasibilityProblem
-from jaxmpc.feasible.rays import Rays, close_gap
+from jaxmpc.feasible.rays import closed_bounds
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import record
 from jaxmpc.qp.status import Status
@@ -209,8 +209,7 @@ class FeasibleSetMap:
             points, _, normals, offsets, _ = policy_hull(self.problem).bounds
             return replace(self, bound_point=points, bound_normal=normals, bound_offset=offsets)
         try:
-            rays = Rays.of(self.problem)
-            proved, left = close_gap(rays, gap, rounds, deadline=deadline)
+            rays, proved, left = closed_bounds(self.problem, gap, rounds, deadline=deadline)
         except ValueError:
             return self
         box = self.problem.programs.bounding_box[0]

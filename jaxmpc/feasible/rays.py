@@ -22,8 +22,7 @@ from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.proofs import Cut
 from jaxmpc.pytrees import record
 from jaxmpc.qp.jax_transformations import own_modes
-from jaxmpc.sets.convex_sets import Polytope
-from jaxmpc.sets.geometry import hull_volume
+from jaxmpc.sets.geometry import Frame, hull_volume
 from jaxmpc.sets.lp import power_of_two
 
 # How far a boundary point is moved towards the centre before it is proved: the least that works.
@@ -106,13 +105,15 @@ def ray_directions(count: int, d: int) -> np.ndarray:
 class Rays:
     """Rays from one centre of the feasible set, for any number of directions.
 
-    center (d,) with w: a feasible pair with a margin. exact: the data for proofs.
+    center (d,) with w: a feasible pair with a margin. exact: the data for proofs; data:
+    these and the rows, on the device.
     """
 
     problem: FeasibilityProblem
     center: np.ndarray
     w: np.ndarray
     exact: ExactData
+    data: tuple[ExactData, ConstraintRows]
 
     @classmethod
     def of(cls, problem: FeasibilityProblem, center: np.ndarray | None = None) -> "Rays":
@@ -121,7 +122,9 @@ class Rays:
         Raises ValueError where the feasible set is empty or flat, or the centre not inside it.
         """
         center, w = problem.programs.center(center)
-        return cls(problem, center, w, problem.exact(np.abs(center)))
+        exact = problem.exact(np.abs(center))
+        with jax.enable_x64(True):
+            return cls(problem, center, w, exact, jax.device_put((exact, problem.rows)))
 
     def box(self) -> ProvedBounds:
         """Return the half-spaces of the bounding box, those that exist."""
@@ -160,7 +163,7 @@ class Rays:
         """Return `prove_rays` of (K, backoffs, …) points and (K, R) multipliers."""
         count, fill = len(y), filled(len(y))
         with jax.enable_x64(True):
-            found = prove_rays(self.exact, self.problem.rows, theta[fill], w[fill], y[fill])
+            found = prove_rays(*self.data, theta[fill], w[fill], y[fill])
         return jax.tree.map(lambda v: np.asarray(v)[:count], found)
 
 
@@ -236,22 +239,45 @@ def close_gap(
     unit = power_of_two(np.zeros(d) if box is None else np.ptp(box, axis=0))
     directions = np.concatenate([np.eye(d), -np.eye(d), -np.ones((1, d))])
     proved, sent, left = rays.box(), of_length_one(directions), np.inf
+    bounded, center = len(proved.offsets) == 2 * d, rays.center / unit
     for _ in range(rounds):
         if time.monotonic() > deadline:
             break
         proved = proved.joined(rays.cast(directions * unit)._proved)
-        try:
-            outer = Polytope(proved.normals * unit, proved.offsets).require_body().reduce()
-            low, high = hull_volume(proved.points / unit), outer.volume()
-            directions = fresh(outer.vertices() - rays.center / unit, sent)
-            sent = np.concatenate([sent, of_length_one(directions)])
-        except ValueError:  # unbounded, or too thin for qhull
+        slack = proved.offsets - proved.normals @ rays.center
+        if not len(slack) or slack.min() <= 0:  # thinner than rounding
             break
+        outer = Frame.about(center, proved.normals * unit, slack)
+        if not bounded and not outer.bounded:
+            break
+        try:
+            vertices = outer.vertices()
+            low, high = hull_volume(proved.points / unit), hull_volume(vertices)
+        except ValueError:  # too thin for qhull
+            break
+        directions = fresh(vertices - center, sent)
+        sent = np.concatenate([sent, of_length_one(directions)])
         left = (high - low) / high
         # Sets with a curved boundary have no end of vertices.
         if left <= gap or not 0 < len(directions) <= most:
             break
     return proved, left
+
+
+def closed_bounds(
+    problem: FeasibilityProblem, gap: float, rounds: int, most: int = MOST_RAYS, **how: float
+) -> tuple[Rays, ProvedBounds, float]:
+    """Return rays, what they have proved and the gap that is left, as in `close_gap`; those of an
+    earlier call where that left no more than `gap`.
+
+    Raises ValueError where the feasible set is empty or flat.
+    """
+    known = problem.memory.get("bounds")
+    if known is None or known[-1] > gap:
+        rays = Rays.of(problem)
+        known = rays, *close_gap(rays, gap, rounds, most, **how)
+        problem.memory["bounds"] = known
+    return known
 
 
 def of_length_one(directions: np.ndarray) -> np.ndarray:

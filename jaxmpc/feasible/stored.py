@@ -432,6 +432,8 @@ class HalfSpaces:
         not matter."""
         scale = np.max(np.abs(normals), axis=1)
         known = np.isfinite(offsets) & (scale > 0) & np.isfinite(scale)
+        # Neighbours on a grid often have the same.
+        known[1:] &= np.any(np.diff(normals, axis=0) != 0, axis=1) | (np.diff(offsets) != 0)
         normals, offsets, scale = normals[known], offsets[known], scale[known]
         if self.vertices is not None:
             values = np.max(self.vertices @ (normals / scale[:, None]).T, axis=0)

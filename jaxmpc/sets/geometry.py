@@ -54,6 +54,26 @@ class Frame(NamedTuple):
     center: np.ndarray
     scale: np.ndarray
 
+    @classmethod
+    def about(cls, center: np.ndarray, G: np.ndarray, slack: np.ndarray) -> "Frame":
+        """Return the frame about a point inside, which every row keeps with this slack,
+        g - G center > 0."""
+        Y = G / slack[:, None]
+        top = np.abs(Y).max(axis=0, initial=0.0)
+        scale = 1 / np.where(top > 0, top, 1.0)
+        return cls(Y * scale, center, scale)
+
+    def vertices(self) -> np.ndarray:
+        """Return the vertices (k, n) of a bounded set, counter-clockwise in 2-D."""
+        Z = self.Z[irredundant(self.Z)]
+        if len(self.center) == 1:
+            return np.sort(self.center + self.scale / Z, axis=0)
+        V = dual_hull(Z).intersections
+        V = V[distinct(V / np.abs(V).max(axis=0), 1e-10)]
+        if len(self.center) == 2:
+            V = V[np.argsort(np.arctan2(V[:, 1], V[:, 0]))]
+        return self.center + V * self.scale
+
     @property
     def bounded(self) -> bool:
         """Return whether the set is bounded: no ray r with Z r <= 0, by one LP, its answer
@@ -111,10 +131,7 @@ def framed(argument: str, G: np.ndarray, g: np.ndarray) -> Frame:
             flat(margin)
         center = center + unit * step
         slack = slack_at(center)
-    Y = G / slack[:, None]
-    top = np.abs(Y).max(axis=0, initial=0.0)
-    scale = 1 / np.where(top > 0, top, 1.0)
-    return Frame(Y * scale, center, scale)
+    return Frame.about(center, G, slack)
 
 
 def implied_equalities(G: np.ndarray, g: np.ndarray, tolerance: float = FLAT) -> np.ndarray:

@@ -548,7 +548,7 @@ class Polytope(LinearSet):
         frame = framed("Polytope", hull.G, hull.g)
         if not frame.bounded:
             fail("Polytope", "is unbounded: it is no hull of vertices", "Intersect it with a Box")
-        return hull.shift + _frame_vertices(frame) @ hull.basis.T
+        return hull.shift + frame.vertices() @ hull.basis.T
 
     def volume(self) -> float:
         """Return the length, area or volume, of a product of sets factor by factor: 0 if the set
@@ -1113,19 +1113,6 @@ def _vertices_of(set_: LinearSet) -> np.ndarray | None:
         return set_.vertices()
     except ValueError:
         return None
-
-
-def _frame_vertices(frame: Frame) -> np.ndarray:
-    """Return the vertices (k, n) of a bounded set with volume."""
-    Z = frame.Z[geometry.irredundant(frame.Z)]
-    center, scale = frame.center, frame.scale
-    if len(center) == 1:
-        return np.sort(center + scale / Z, axis=0)
-    V = geometry.dual_hull(Z).intersections
-    V = V[geometry.distinct(V / np.abs(V).max(axis=0), 1e-10)]
-    if len(center) == 2:
-        V = V[np.argsort(np.arctan2(V[:, 1], V[:, 0]))]
-    return center + V * scale
 
 
 def as_polytope(argument: str, value: object, n: int | None = None) -> Polytope:

@@ -5,8 +5,14 @@ one warp runs all stages of one problem with the running vector or matrix in its
 Triton). On CPUs the matrices of a batch stand side by side (the batch in the last axis, which XLA
 vectorises: 40 µs for 14 states, 7 inputs and 20 stages, 67 as a batched scan). Everywhere else, and
 for derivatives, the scans serve.
+
+Long horizons are divided into √N pieces of √N stages on a GPU (`_in_pieces`). In a piece
+y_k = l_k + Φ_k s with the recurrence l from zero, the products Φ of its matrices and its start s: all
+pieces have their l and Φ at once, and their starts follow one from the other, by a recurrence of √N
+stages. (A scan over partial products, as Blelloch's of 1990, has log N steps of larger products.)
 """
 
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -22,6 +28,8 @@ from jaxmpc.qp.triton import barrier, call, indices, load, padded_side, store
 
 # Numbers along a side that a warp's registers hold.
 MOST = 32
+# Stages from which on a horizon is divided into pieces on a GPU.
+LONG = 128
 
 
 class Gains(NamedTuple):
@@ -40,7 +48,8 @@ def recurrence(M: Array, w: Array, start: Array, *, adjoint: bool = False) -> Ar
     M (N, n, n), or (n, n) the same at all stages; w (N, n); start (n,).
     """
     scan = partial(_scan, adjoint=adjoint)
-    return _or_kernel(scan, partial(_recurrence_kernel, adjoint=adjoint), M, w, start)
+    kernel = _recurrence_kernel if len(w) < LONG else _in_pieces
+    return _or_kernel(scan, partial(kernel, adjoint=adjoint), M, w, start)
 
 
 def tracking(
@@ -53,8 +62,9 @@ def tracking(
 
     gx (N+1, n), gu (N, m); A (n, n) and B (n, m), or one a stage.
     """
-    scan = partial(_tracking_scan, unroll=unroll)
-    return _or_kernel(scan, _tracking_kernel, *gains, A, B, gx, gu)
+    scan = partial(_tracking_by, partial(_scan, unroll=unroll))
+    kernel = _tracking_kernel if len(gu) < LONG else partial(_tracking_by, _in_pieces)
+    return _or_kernel(scan, kernel, *gains, A, B, gx, gu)
 
 
 def riccati_recursion(Q: Array, R: Array, cross: Any, A: Array, B: Array) -> Gains:
@@ -65,6 +75,31 @@ def riccati_recursion(Q: Array, R: Array, cross: Any, A: Array, B: Array) -> Gai
     if cross is not None:
         return _riccati_scan(Q, R, A, B, cross)
     return _or_kernel(_riccati_scan, _riccati_kernel, Q, R, A, B, lanes=_riccati_lanes)
+
+
+def covariances(closed: Array, noise: Array) -> Array:
+    """Σ (N, n, n) after each stage: Σ⁺ = C Σ C' + W from Σ = 0 with C, W (N, n, n) of the stage."""
+    N, n, _ = closed.shape
+    length = math.isqrt(N - 1) + 1 if on_gpu() and N >= LONG else N
+    moved = lambda C, S: matmul(C, matmul(S, jnp.swapaxes(C, -1, -2)))
+
+    def stage(carry: tuple, at: tuple) -> tuple[tuple, tuple]:
+        (S, product), (C, W) = carry, at
+        after = moved(C, S) + W, matmul(C, product)
+        return after, after
+
+    def piece(C: Array, W: Array) -> tuple[Array, Array]:
+        return jax.lax.scan(stage, (jnp.zeros_like(W[0]), jnp.eye(n, dtype=W.dtype)), (C, W))[1]
+
+    if length == N:
+        return piece(closed, noise)[0]
+    # Pieces side by side, then their starts one from the other, as in `_in_pieces`.
+    missing = -N % length
+    pieces = lambda v: jnp.pad(v, ((0, missing), (0, 0), (0, 0))).reshape(-1, length, n, n)
+    local, products = jax.vmap(piece)(pieces(closed), pieces(noise))
+    advance = lambda S, end: (moved(end[1], S) + end[0], S)
+    starts = jax.lax.scan(advance, jnp.zeros_like(noise[0]), (local[:, -1], products[:, -1]))[1]
+    return (local + moved(products, starts[:, None])).reshape(-1, n, n)[:N]
 
 
 def _or_kernel(scan: Callable, kernel: Callable, *args: Array, lanes: Any = None) -> Any:
@@ -100,7 +135,8 @@ def _scan(M: Array, w: Array, start: Array, *, adjoint: bool, unroll: int = 1) -
     return jax.lax.scan(stage, start, xs, reverse=adjoint, unroll=unroll)[1]
 
 
-def _tracking_scan(
+def _tracking_by(
+    recurrence: Callable,
     closed: Array,
     K: Array,
     inverse: Array,
@@ -108,17 +144,15 @@ def _tracking_scan(
     B: Array,
     gx: Array,
     gu: Array,
-    *,
-    unroll: int = 1,
 ) -> tuple[Array, Array]:
     apply = lambda M, v: jnp.einsum("...ij,...j->...i", M, v, precision="highest")
     turned = lambda M, v: apply(jnp.swapaxes(M, -1, -2), v)
     h = gx[:-1] + turned(K, gu)
-    p = _scan(closed, -h, -gx[-1], adjoint=True, unroll=unroll)
+    p = recurrence(closed, -h, -gx[-1], adjoint=True)
     p = jnp.concatenate([p[1:], -gx[-1:]])  # of the stage after
     d = apply(inverse, gu - turned(B, p))
     start = jnp.zeros_like(gx[0])
-    x = _scan(closed, apply(B, d), start, adjoint=False, unroll=unroll)
+    x = recurrence(closed, apply(B, d), start, adjoint=False)
     x = jnp.concatenate([start[None], x])
     return x, apply(K, x[:-1]) + d
 
@@ -187,6 +221,32 @@ def _recurrence_kernel(M: Array, w: Array, start: Array, *, adjoint: bool) -> Ar
         jax.lax.fori_loop(jnp.int32(0), jnp.int32(N), stage, load(start_ref.at[i], here))
 
     return call(kernel, jax.ShapeDtypeStruct((N, n), w.dtype))(M, w, start)
+
+
+def _in_pieces(M: Array, w: Array, start: Array, *, adjoint: bool) -> Array:
+    """The recurrence by pieces that run side by side."""
+    N, n = w.shape
+    length = math.isqrt(N - 1) + 1
+    missing = -N % length
+    # Where the recurrence ends, so that what is added comes after it.
+    pieces = lambda v: jnp.pad(
+        v, [(missing, 0) if adjoint else (0, missing), *[(0, 0)] * (v.ndim - 1)]
+    ).reshape(-1, length, *v.shape[1:])
+    own = None if M.ndim == 2 else 0
+    M, w = (M if own is None else pieces(M)), pieces(w)
+    run = partial(_recurrence_kernel, adjoint=adjoint)
+    local = jax.vmap(run, in_axes=(own, 0, None))(M, w, jnp.zeros_like(start))
+    columns = jax.vmap(run, in_axes=(None, None, 0), out_axes=2)
+    product = lambda M: columns(M, jnp.zeros_like(w[0]), jnp.eye(n, dtype=w.dtype))
+    products = product(M) if own is None else jax.vmap(product)(M)
+    products = jnp.broadcast_to(products, (len(w), length, n, n))
+    last = 0 if adjoint else -1
+    turned = jnp.swapaxes(products[:, last], 1, 2) if adjoint else products[:, last]
+    ends = run(turned, local[:, last], start)
+    starts = [ends[1:], start[None]] if adjoint else [start[None], ends[:-1]]
+    moved = jnp.einsum("pkij,pj->pki", products, jnp.concatenate(starts), precision="highest")
+    y = (local + moved).reshape(-1, n)
+    return y[missing:] if adjoint else y[:N]
 
 
 def _tracking_kernel(

@@ -36,7 +36,7 @@ from jaxmpc.mpc.stagewise.newton_steps import (
     stage_conditions,
     stage_newton_step,
 )
-from jaxmpc.mpc.stagewise.recursion_kernels import Gains
+from jaxmpc.mpc.stagewise.recursion_kernels import Gains, covariances
 from jaxmpc.mpc.stagewise.stages import (
     Stages,
     cleaned,
@@ -192,16 +192,8 @@ def _factor(mpc: MPC, rho: Any, scale: Any, steps: bool) -> StageFactor:
 def row_scale(s: Stages) -> Array:
     """E (rows,): 1/E² is the variance of the row under exp(−J); 0 where that is zero."""
     gains = riccati(s)
-
-    def forward(Sigma: Array, stage: tuple) -> tuple[Array, Array]:
-        (closed, _, inverse), B = stage
-        B = s.B if B is None else B
-        spread = matmul(B, matmul(inverse, B.T))
-        return matmul(closed, matmul(Sigma, closed.T)) + spread, Sigma
-
-    start = jnp.zeros_like(s.P)
-    last, Sigma = jax.lax.scan(forward, start, (gains, *s.varying("B")))
-    Sigma = jnp.concatenate([Sigma, last[None]])
+    spread = matmul(s.B, matmul(gains.inverse, jnp.swapaxes(s.B, -1, -2)))
+    Sigma = jnp.concatenate([jnp.zeros_like(s.P)[None], covariances(gains.closed, spread)])
     variance, own = [jnp.zeros(0, s.Q.dtype)], [jnp.zeros(0, s.Q.dtype)]
     square = lambda M, V: jnp.sum(matmul(M, V) * M, axis=-1)
     deviation = lambda V: jnp.sqrt(jnp.maximum(jnp.diagonal(V, axis1=-2, axis2=-1), 0.0))
