@@ -1,8 +1,10 @@
 """The command `jaxmpc`, also as `python -m jaxmpc`: Ctrl-C ends it with one line from the start."""
 
+import contextlib
 import os
 import signal
 import sys
+import threading
 import warnings
 from typing import Any
 
@@ -12,12 +14,24 @@ def main() -> int:
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _stop)  # until the command begins, see `cli.main`
     warnings.formatwarning = lambda message, *_, **__: f"jaxmpc: {message}\n"
-    from jaxmpc.app.program_cache import kept_programs
+    from jaxmpc.app.program_cache import KEEPING, kept_programs
 
-    with kept_programs(sys.argv[1:]):  # before JAX is imported
+    words = sys.argv[1:]
+    with kept_programs(words):  # before JAX is imported
+        if words and words[0] in KEEPING and not {"-h", "--help"} & {*words}:
+            threading.Thread(target=_start_device).start()
         from jaxmpc.app import cli
 
         return cli.main()
+
+
+def _start_device() -> None:
+    """Use JAX's device once, which takes a GPU a second, while the command's modules are
+    imported."""
+    with contextlib.suppress(Exception):  # it is reported where a result is needed
+        import jax
+
+        jax.block_until_ready(jax.device_put(0))
 
 
 def _stop(*_: Any) -> None:

@@ -72,7 +72,7 @@ def simulate_into(
     settings: JSON data that determine the runs: a store with others is refused. None: hashes of
         controller, model, references and factors.
     chunk: robots of a block, which run at once, and are written at once while the next ones run: a
-        killed run loses two blocks at most.
+        killed run loses the block that runs and those being written (`store.BlockWriter`).
     resume: go on with the runs at `path`. overwrite: put new ones in their place, once their first
         block is done. Without either there must be none.
     progress: show a progress bar, where stderr is a terminal.

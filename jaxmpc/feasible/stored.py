@@ -220,9 +220,10 @@ def sweep_into(
     path: a folder or URL (`jaxmpc.store`), which xarray.open_zarr reads. mpc, axes, fixed,
     iterations, dtype, executor, devices: as in `map_feasible_set`. along: the coordinates of the
     grid along each of the d mapped states. chunk: points of a block at most, which is written
-    at once while the next is labelled: a killed run loses these two. None: as in the store to go on
-    with; in a new one up to 131,072, see `store.writing.default_block`. Programs take parts of
-    `default_chunk` points at most. gap: of `StoredMap.refine` at the end, None to skip it.
+    at once while the next is labelled: a killed run loses that one and those being written
+    (`store.BlockWriter`). None: as in the store to go on with; in a new one up to 131,072, see
+    `store.writing.default_block`. Programs take parts of `default_chunk` points at most. gap: of
+    `StoredMap.refine` at the end, None to skip it.
 
     settings: JSON data that determine the labels: a store with others is refused; None: iterations
     and dtype. shard: (i, n) to label the blocks k with k mod n = i, beside other processes; the

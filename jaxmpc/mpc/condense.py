@@ -26,7 +26,12 @@ from jaxmpc.mpc.problem import MPC, Switch, Weights, dynamics_of, weights_of
 from jaxmpc.mpc.rows import Layout, blocks, bounds_of, layout_of, split, stacked
 from jaxmpc.mpc.tightening import require_room, require_tightened, with_gain
 from jaxmpc.pytrees import pytree, static
-from jaxmpc.qp.jax_transformations import compiled_lightly, own_modes, varying
+from jaxmpc.qp.jax_transformations import (
+    compiled_lightly,
+    differentiated_apart,
+    own_modes,
+    varying,
+)
 from jaxmpc.qp.linalg import arrays, floating_dtype, matmul, solve
 from jaxmpc.qp.problem import QP, Bounds
 from jaxmpc.systems.riccati import lqr
@@ -87,12 +92,9 @@ class Condensed:
         if input_reference is not None:
             weighted = self.weights.of_inputs(input_reference)
             q = q - 2 * jnp.einsum("kmi,km->i", self.Omega, weighted, precision="highest")
-        # As one product the sum over a batch in d's derivative is a product too: on a GPU XLA's own
-        # sums of columns take ten times as long.
-        one = jnp.append(theta, jnp.ones((), theta.dtype))
-        constant = matmul(one, jnp.column_stack([self.D, self.d]).T)
+        constant = matmul(self.D, theta) + self.d
         constant = constant if shift is None else constant + shift
-        l, u = self.lower - constant, self.upper - constant
+        l, u = differentiated_apart((self.lower - constant, self.upper - constant))
         soft = self.soft_linear, self.soft_quadratic
         return QP(self.P, q, self.C, l, u, *soft, self.radius, self.limits.sizes(), self.balls)
 

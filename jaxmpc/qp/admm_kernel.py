@@ -107,7 +107,7 @@ def iterate_batch(
         vectors.append(jnp.pad(radius, ((0, 0), (free, 0)), constant_values=jnp.inf))
         matrices.append(jnp.asarray(same, dtype))
 
-    def kernel(*refs: Ref) -> None:
+    def admm_steps(*refs: Ref) -> None:
         alpha_ref, rho_ref, *rest, out_ref, previous_ref = refs
         matrix_refs, (b_ref, t_ref, *bound_refs) = rest[: len(matrices)], rest[len(matrices) :]
         tile = Tile(program() * T + indices(T), B, m)
@@ -137,7 +137,7 @@ def iterate_batch(
                 tile.store(ref, i, v)
 
     shapes = [jax.ShapeDtypeStruct((B, m), dtype)] * 2
-    run = call(kernel, shapes, WARPS, (-(-B // T),))
+    run = call(admm_steps, shapes, WARPS, (-(-B // T),))
     return tuple(run(jnp.reshape(alpha, 1).astype(dtype), made.rho, *matrices, *vectors))
 
 

@@ -273,7 +273,7 @@ def _damped(m: int, rows: int, side: int, damping: float, steps: int, dtype: jnp
     """Return the kernel (count (1,), S, W, Lambda, b) → y (k,) with systems of `rows` rows at most,
     in arrays of `side`; y is zero where the count is."""
 
-    def kernel(
+    def damped_steps(
         count_ref: Ref, S_ref: Ref, W_ref: Ref, Lambda_ref: Ref, b_ref: Ref, y_ref: Ref
     ) -> None:
         k, count = indices(side), count_ref[0]
@@ -301,7 +301,7 @@ def _damped(m: int, rows: int, side: int, damping: float, steps: int, dtype: jnp
         store(y_ref.at[k], y, k < rows)
 
     warps = 1 if side <= LEAST else 4 if side <= 32 else 8
-    program = call(kernel, jax.ShapeDtypeStruct((rows,), dtype), warps)
+    program = call(damped_steps, jax.ShapeDtypeStruct((rows,), dtype), warps)
 
     def run(count: Array, S: Array, W: Array, Lambda: Array, b: Array) -> Array:
         y = program(count, S, W[:rows], Lambda[:rows], b[:rows])

@@ -425,7 +425,7 @@ def _search(dual: Dual, rows: int, side: int, steps: MostSteps, *, last: bool) -
     m, dtype = S.shape[-1], S.dtype
     width = padded_side(m)
 
-    def kernel(*refs: Ref) -> None:
+    def dual_steps(*refs: Ref) -> None:
         limit_ref, cold_ref, flags_in, S_ref, y_in, v_in, *others = refs
         *bound_refs, y_ref, v_ref, flags_ref, order_ref, change_ref, moved_ref = others
         i, k, few = indices(width), indices(side), indices(ROWS)
@@ -494,7 +494,7 @@ def _search(dual: Dual, rows: int, side: int, steps: MostSteps, *, last: bool) -
     scratch = [(side + width, jnp.int32), (side, dtype), (m + side, dtype)]
     shapes = [jax.ShapeDtypeStruct((count,), kind) for count, kind in vectors + scratch]
     warps = 1 if width <= 64 and side <= LEAST else 2 if side <= 32 and width <= 128 else 4
-    program = call(kernel, shapes, warps, aliases={2: 2, 4: 0, 5: 1})
+    program = call(dual_steps, shapes, warps, aliases={2: 2, 4: 0, 5: 1})
 
     def run(limit: Array, cold: Array, flags: Array, y: Array, v: Array) -> tuple[Array, ...]:
         return tuple(program(limit[None], cold, flags, S, y, v, *bounds.columns)[:3])

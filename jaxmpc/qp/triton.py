@@ -118,7 +118,7 @@ def in_one_program(
     """
     dtype = data[0][0].dtype
 
-    def kernel(*refs: Ref) -> None:
+    def in_registers(*refs: Ref) -> None:
         *in_refs, numbers_ref = refs
         in_refs, out_refs = in_refs[: len(data)], in_refs[len(data) :]
 
@@ -137,5 +137,5 @@ def in_one_program(
         store(numbers_ref.at[k], together, k < numbers)
 
     shapes = [jax.ShapeDtypeStruct((count,), dtype) for count in [*lengths, numbers]]
-    *vectors, found = call(kernel, shapes)(*(vector for vector, _ in data))
+    *vectors, found = call(in_registers, shapes)(*(vector for vector, _ in data))
     return vectors, list(found)

@@ -1,26 +1,32 @@
 """Blocks put together from parts, each written while the next one is computed."""
 
+from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Self
 
 import numpy as np
 
+from jaxmpc.batches import cores
 from jaxmpc.store.writing import Store
+
+# Blocks that are written at a time at most.
+WRITERS = 4
 
 
 class BlockWriter:
     """Puts the parts of blocks together, and writes each whole block in a thread of its own.
 
-    One block is filled and at most one is written at a time; a process that is killed loses these
-    two. An error of the thread, such as that
-    of a full disk, is raised by a later `put`, or at the end of the context. Its end, by an
-    interruption too, waits for the block that is written; one that is not whole is dropped.
+    One block is filled and at most `WRITERS` are written at a time, on two cores one; a process
+    that is killed loses these. An error of a thread, such as that of a full disk, is raised by a
+    later `put`, or at the end of the context. Its end, by an interruption too, waits for the blocks
+    that are written; one that is not whole is dropped.
     """
 
     def __init__(self, store: Store) -> None:
         self.store = store
-        self._thread = ThreadPoolExecutor(1, "blocks")
-        self._writing: Future[None] | None = None
+        self._most = max(1, min(WRITERS, cores() // 2))
+        self._threads = ThreadPoolExecutor(self._most, "blocks")
+        self._writing: deque[Future[None]] = deque()
         self._block, self._missing = -1, 0
         self._rows: dict[str, np.ndarray] = {}
 
@@ -28,9 +34,9 @@ class BlockWriter:
         return self
 
     def __exit__(self, error: object, *_: object) -> None:
-        self._thread.shutdown()
+        self._threads.shutdown()
         if error is None:
-            self._wait()
+            self._wait(0)
 
     def put(self, block: int, part: slice, **rows: np.ndarray) -> None:
         """Take all variables of a part of a block, (samples of the part, ...). part: its samples,
@@ -50,11 +56,12 @@ class BlockWriter:
                 self._rows[name][part.start - whole.start : part.stop - whole.start] = value
         self._missing -= size
         if not self._missing:
-            self._wait()
-            self._writing = self._thread.submit(self.store.commit, block, **self._rows)
+            # The first block of a store that replaces another one puts it in its place.
+            self._wait(0 if self.store.replaces else self._most - 1)
+            self._writing.append(self._threads.submit(self.store.commit, block, **self._rows))
             self._block = -1
 
-    def _wait(self) -> None:
-        """Wait for the block that is written; raise the error that it ended in."""
-        if self._writing is not None:
-            self._writing.result()
+    def _wait(self, most: int) -> None:
+        """Wait until `most` blocks are still written; raise the error that one ended in."""
+        while len(self._writing) > most:
+            self._writing.popleft().result()

@@ -302,6 +302,11 @@ class Store:
             self._arrays[name] = array_of(self.group, name)
         return self._arrays[name]
 
+    @property
+    def replaces(self) -> bool:
+        """Return whether the next block that is done puts the store in the place of an old one."""
+        return self._aside is not None
+
     def commit(self, block: int, **rows: np.ndarray) -> None:
         """Write all variables of a block, (samples of the block, ...), then mark it done."""
         region, written = self.regions[block], []

@@ -90,7 +90,8 @@ class Sweep:
       robot_map.npz  x0s, states, predicted, held (1 yes, -1 no, 0 undecided), within_limits,
                      recursive, feasible, depth, worst (most beyond a limit), broken_at, lost_at,
                      unsolved_at.
-      robot_map.zarr The state for --resume: a killed run loses two blocks of 256 states.
+      robot_map.zarr The state for --resume: a killed run loses the blocks of 256 states
+                     that run or are being written.
 
     What the TOML file holds (n states, m inputs; dt in seconds, other units are yours)
       name = "joint"

@@ -7,9 +7,9 @@ vectorises: 40 µs for 14 states, 7 inputs and 20 stages, 67 as a batched scan).
 for derivatives, the scans serve.
 
 Long horizons are divided into √N pieces of √N stages on a GPU (`_in_pieces`). In a piece
-y_k = l_k + Φ_k s with the recurrence l from zero, the products Φ of its matrices and its start s: all
-pieces have their l and Φ at once, and their starts follow one from the other, by a recurrence of √N
-stages. (A scan over partial products, as Blelloch's of 1990, has log N steps of larger products.)
+y_k = l_k + Φ_k s with the recurrence l from zero, the products Φ of its matrices and its start s:
+all pieces have their l and Φ at once, and their starts follow one from the other, by a recurrence
+of √N stages. (Blelloch's scan of 1990 over partial products has log N steps of larger products.)
 """
 
 import math
@@ -205,7 +205,7 @@ def _riccati_lanes(Q: Array, R: Array, A: Array, B: Array) -> Gains:
 def _recurrence_kernel(M: Array, w: Array, start: Array, *, adjoint: bool) -> Array:
     N, n = w.shape
 
-    def kernel(M_ref: Any, w_ref: Any, start_ref: Any, out_ref: Any) -> None:
+    def recurrence_stages(M_ref: Any, w_ref: Any, start_ref: Any, out_ref: Any) -> None:
         i = indices(padded_side(n))
         here = i < n
         shared = _matrix(M_ref, None, n, n) if M.ndim == 2 else None
@@ -220,7 +220,7 @@ def _recurrence_kernel(M: Array, w: Array, start: Array, *, adjoint: bool) -> Ar
 
         jax.lax.fori_loop(jnp.int32(0), jnp.int32(N), stage, load(start_ref.at[i], here))
 
-    return call(kernel, jax.ShapeDtypeStruct((N, n), w.dtype))(M, w, start)
+    return call(recurrence_stages, jax.ShapeDtypeStruct((N, n), w.dtype))(M, w, start)
 
 
 def _in_pieces(M: Array, w: Array, start: Array, *, adjoint: bool) -> Array:
@@ -255,7 +255,7 @@ def _tracking_kernel(
     # K and G⁻¹ are half of what `closed` is to read, and reading is what takes the time.
     (N, m), n = gu.shape, gx.shape[-1]
 
-    def kernel(*refs: Any) -> None:
+    def tracking_stages(*refs: Any) -> None:
         K_ref, inverse_ref, A_ref, B_ref, gx_ref, gu_ref, x_ref, u_ref = refs
         side = padded_side(max(n, m))
         i = indices(side)
@@ -291,7 +291,7 @@ def _tracking_kernel(
         store(x_ref.at[N, i], x, state)
 
     out = [jax.ShapeDtypeStruct(v.shape, v.dtype) for v in (gx, gu)]
-    x, u = call(kernel, out)(K, inverse, A, B, gx, gu)
+    x, u = call(tracking_stages, out)(K, inverse, A, B, gx, gu)
     return x, u
 
 
@@ -300,7 +300,7 @@ def _riccati_kernel(Q: Array, R: Array, A: Array, B: Array) -> Gains:
     side = padded_side(max(n, m))
     dot = partial(triton.dot, product=triton.EXACT)
 
-    def kernel(*refs: Any) -> None:
+    def riccati_stages(*refs: Any) -> None:
         Q_ref, R_ref, A_ref, B_ref, closed_ref, K_ref, inverse_ref = refs
         i = indices(side)
         row, column = i[:, None], i[None, :]
@@ -335,7 +335,7 @@ def _riccati_kernel(Q: Array, R: Array, A: Array, B: Array) -> Gains:
 
     shapes = [(N, n, n), (N, m, n), (N, m, m)]
     out = [jax.ShapeDtypeStruct(shape, dtype) for shape in shapes]
-    return Gains(*call(kernel, out)(Q, R, A, B))
+    return Gains(*call(riccati_stages, out)(Q, R, A, B))
 
 
 def _matrix(ref: Any, k: Any, rows: int, columns: int, side: int | None = None) -> Array:
