@@ -106,7 +106,7 @@ class Rays:
     """Rays from one centre of the feasible set, for any number of directions.
 
     center (d,) with w: a feasible pair with a margin. exact: the data for proofs; data:
-    these and the rows, on the device.
+    these and the rows, on `processor()`.
     """
 
     problem: FeasibilityProblem
@@ -124,7 +124,8 @@ class Rays:
         center, w = problem.programs.center(center)
         exact = problem.exact(np.abs(center))
         with jax.enable_x64(True):
-            return cls(problem, center, w, exact, jax.device_put((exact, problem.rows)))
+            data = jax.device_put((exact, problem.rows), processor())
+        return cls(problem, center, w, exact, data)
 
     def box(self) -> ProvedBounds:
         """Return the half-spaces of the bounding box, those that exist."""
@@ -165,6 +166,15 @@ class Rays:
         with jax.enable_x64(True):
             found = prove_rays(*self.data, theta[fill], w[fill], y[fill])
         return jax.tree.map(lambda v: np.asarray(v)[:count], found)
+
+
+def processor() -> jax.Device:
+    """Return the device that proves what few rays find, one after the other: a CPU where JAX has
+    one, which on a GPU would mean waiting for many small kernels."""
+    try:
+        return jax.local_devices(backend="cpu")[0]
+    except RuntimeError:  # JAX_PLATFORMS leaves it out
+        return jax.local_devices()[0]
 
 
 def filled(count: int) -> np.ndarray:

@@ -65,10 +65,10 @@ class Frame(NamedTuple):
 
     def vertices(self) -> np.ndarray:
         """Return the vertices (k, n) of a bounded set, counter-clockwise in 2-D."""
-        Z = self.Z[irredundant(self.Z)]
         if len(self.center) == 1:
-            return np.sort(self.center + self.scale / Z, axis=0)
-        V = dual_hull(Z).intersections
+            ends = self.scale / np.array([self.Z.min(), self.Z.max()])
+            return self.center + ends[:, None]
+        V = dual_hull(self.Z).intersections
         V = V[distinct(V / np.abs(V).max(axis=0), 1e-10)]
         if len(self.center) == 2:
             V = V[np.argsort(np.arctan2(V[:, 1], V[:, 0]))]
