@@ -85,7 +85,7 @@ class Condensed:
     ) -> QP:
         """QP at θ (p,). reference (N+1, n), input_reference (N, m): what to track, None for 0.
         shift (rows,): added to the rows, None for 0."""
-        q = matmul(self.F, theta) + self.f
+        q = differentiated_apart(matmul(self.F, theta) + self.f)
         if reference is not None:
             weighted = self.weights.of_states(reference)
             q = q - 2 * jnp.einsum("kni,kn->i", self.Gamma, weighted, precision="highest")
@@ -94,7 +94,7 @@ class Condensed:
             q = q - 2 * jnp.einsum("kmi,km->i", self.Omega, weighted, precision="highest")
         constant = matmul(self.D, theta) + self.d
         constant = constant if shift is None else constant + shift
-        l, u = differentiated_apart((self.lower - constant, self.upper - constant))
+        l, u = self.lower - constant, self.upper - constant
         soft = self.soft_linear, self.soft_quadratic
         return QP(self.P, q, self.C, l, u, *soft, self.radius, self.limits.sizes(), self.balls)
 
