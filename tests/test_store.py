@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+import threading
 import time
 import warnings
 
@@ -18,7 +19,7 @@ from damage import turned_bits
 from jaxmpc import store
 from jaxmpc.feasible.map import BOUNDS
 from jaxmpc.feasible.stored import dimension_names, label_fields, stored_labels
-from jaxmpc.store import BlockWriter, Constant, Store
+from jaxmpc.store import BlockWriter, Constant, Store, block_writer
 from jaxmpc.store.reading import regions
 from jaxmpc.store.writing import block_shape, default_block
 
@@ -197,9 +198,40 @@ class TestBlockWriter:
             assert kept.pending() == [1, 2]
         assert not store.read(path).problems
 
+    @pytest.mark.parametrize("overwrite", [False, True])
+    def test_on_many_cores_several_blocks_are_written_at_once(
+        self, tmp_path, monkeypatch, overwrite
+    ):
+        """But the first one of a store that replaces another is written alone."""
+        path, together, running = tmp_path / "sweep.zarr", [], []
+        monkeypatch.setattr(block_writer, "cores", lambda: 8)
+        begun = threading.Barrier(3 - overwrite, timeout=30)
+        commit = Store.commit
+
+        def slow(kept, block, **rows):
+            running.append(block)
+            if block or not overwrite:
+                begun.wait()  # for all that may be written at once
+            together.append(len(running))
+            commit(kept, block, **rows)
+            running.remove(block)
+
+        if overwrite:
+            with open_store(path) as kept, BlockWriter(kept) as writer:
+                self.put(writer, 0)
+        monkeypatch.setattr(Store, "commit", slow)
+        with open_store(path, overwrite=overwrite) as kept:
+            with BlockWriter(kept) as writer:
+                for block in range(3):
+                    self.put(writer, block)
+            assert not kept.pending()
+        assert together[0] == (1 if overwrite else 3) and max(together) == 3 - overwrite
+        assert store.read(path).done == 3 and not store.read(path).problems
+
     @pytest.mark.parametrize("more", [0, 1])
     def test_an_error_of_the_thread_reaches_the_caller(self, tmp_path, monkeypatch, more):
         """When the next block is whole, or at the end; and no block is marked as done by it."""
+        monkeypatch.setattr(block_writer, "cores", lambda: 2)
 
         def full(array, where, value):
             raise OSError("No space left on device")

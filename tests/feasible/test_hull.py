@@ -6,7 +6,7 @@ import problems
 import pytest
 
 import jaxmpc as jm
-from jaxmpc.feasible import hull_labels, pipeline
+from jaxmpc.feasible import hull_labels, pipeline, rays
 from jaxmpc.feasible.hull_labels import Hull, hull_facets
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.verify.exact import roll_out_exactly
@@ -132,6 +132,18 @@ def test_a_problem_keeps_its_cones(monkeypatch):
     np.testing.assert_array_equal(part.label, whole.label[:100])
     with pytest.raises(ValueError, match="axes, fixed: given with a FeasibilityProblem"):
         jm.map_feasible_set(problem, points, axes=(0, 1))
+
+
+def test_labels_and_bounds_share_their_rays(monkeypatch):
+    """Rays are sent once for the labels, and not again for bounds that are no closer."""
+    monkeypatch.setattr(hull_labels, "MANY", 500)
+    problem = FeasibilityProblem.of(problems.lecture())
+    mapped = jm.map_feasible_set(problem, points_of("lecture", 600))
+    monkeypatch.setattr(rays, "close_gap", lambda *_, **__: pytest.fail("sent again"))
+    low, high = mapped.refine(1e-8).volume_bounds()
+    assert low <= high <= low * (1 + 1e-8)
+    with pytest.raises(pytest.fail.Exception, match="sent again"):
+        mapped.refine(1e-15)
 
 
 @pytest.mark.parametrize("case", ["no interior", "unbounded", "many coordinates"])

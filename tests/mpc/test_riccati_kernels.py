@@ -1,6 +1,8 @@
 """The GPU kernels of the stage recursions, run by Pallas' interpreter, and batches side by side on
 CPUs, against the scans."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -38,10 +40,46 @@ def test_kernels_equal_the_scans(staged):
     )
     found, gains = both(kernels._riccati_scan, kernels._riccati_kernel, Q, R, A, B)
     close(found, gains)
-    close(*both(kernels._tracking_scan, kernels._tracking_kernel, *gains, A, B, gx, gu))
+    scan = functools.partial(kernels._tracking_by, kernels._scan)
+    close(*both(scan, kernels._tracking_kernel, *gains, A, B, gx, gu))
     for adjoint in (False, True):
         scan = lambda *a, adjoint: kernels._scan(*a, adjoint=adjoint, unroll=1)
         close(*both(scan, kernels._recurrence_kernel, A, gx[:, 1:], gx[:, 0], adjoint=adjoint))
+
+
+@pytest.mark.parametrize("N", [5, 9])  # with a last piece that is not full, and with full ones
+@pytest.mark.parametrize("staged", [False, True])
+@pytest.mark.parametrize("adjoint", [False, True])
+def test_recurrences_in_pieces_are_the_scan(N, staged, adjoint):
+    """Of a batch whose matrices are shared or each problem's own."""
+    with jax.enable_x64(True):
+        rng = np.random.default_rng(N)
+        M = rng.normal(size=(2, N, 3, 3) if staged else (2, 3, 3))
+        w, start = rng.normal(size=(2, N, 3)), rng.normal(size=(2, 3))
+        for shared in (False, True):
+            given = (M[0], w, start) if shared else (M, w, start)
+            axes = (None if shared else 0, 0, 0)
+            run = lambda f, axes=axes, given=given: jax.vmap(
+                functools.partial(f, adjoint=adjoint), axes
+            )(*map(jnp.asarray, given))
+            found, expected = run(kernels._in_pieces), run(kernels._scan)
+            np.testing.assert_allclose(found, expected, rtol=1e-13, atol=1e-13)
+
+
+def test_covariances_in_pieces_are_those_of_all_stages(monkeypatch):
+    """They are E[x x'] of x⁺ = C x + e with e of covariance W, summed from each e on its own."""
+    with jax.enable_x64(True):
+        rng = np.random.default_rng(7)
+        C, root = 0.7 * rng.normal(size=(7, 3, 3)), rng.normal(size=(7, 3, 3))
+        expected, moved = [], []
+        for k in range(7):
+            moved = [C[k] @ R for R in moved] + [root[k]]
+            expected.append(sum(R @ R.T for R in moved))
+        given = jnp.asarray(C), jnp.asarray(root @ root.swapaxes(1, 2))
+        for on_gpu in (False, True):
+            monkeypatch.setattr(kernels, "on_gpu", lambda on_gpu=on_gpu: on_gpu)
+            monkeypatch.setattr(kernels, "LONG", 2)
+            np.testing.assert_allclose(kernels.covariances(*given), expected, rtol=1e-12)
 
 
 @pytest.mark.first(1)
