@@ -46,7 +46,8 @@ def export_c(
     ADMM (50 where that is None) and none of Newton's: `solver` is taken with newton_steps=0.
     Nothing is allocated and no loop depends on data but for the branches of a projection, so the
     time of a call hardly varies. What it returns as status comes from residuals that it computes
-    itself. Choose iterations and rho with `tune_solver`, or watch the status along closed loops.
+    itself. Choose iterations and rho with `choose_steps` or `tune_solver`, and see what they reach
+    with `check_fixed_steps`.
 
     References are constant over the horizon. Inputs in a Box are clipped into it.
 
@@ -180,6 +181,22 @@ class ClosedLoopCheck:
     input_error_any: float
 
 
+def require_box(mpc: MPC, lower: Any, upper: Any) -> None:
+    """Raise ValueError where the corners of a box of states are not (n,) finite numbers each."""
+    for argument, bound in (("lower", lower), ("upper", upper)):
+        require_shape(argument, bound, (mpc.system.n,), "Give a number for each state")
+        require_finite(argument, bound)
+
+
+def starting_states(
+    controller: Controller, lower: np.ndarray, upper: np.ndarray, seed: int
+) -> np.ndarray:
+    """Return random states (`LOOPS`, n) of a box, such that have a plan where there are some."""
+    starts = np.random.default_rng(seed).uniform(lower, upper, (50 * LOOPS, len(lower)))
+    status = jax.jit(jax.vmap(lambda x: controller(x).plan.status))(starts)
+    return starts[np.argsort(np.asarray(status) != Status.SOLVED, kind="stable")[:LOOPS]]
+
+
 def check_fixed_steps(
     mpc: MPC,
     solver: ADMM,
@@ -203,16 +220,12 @@ def check_fixed_steps(
     require_kind("solver", solver, ADMM)
     whole("plans", plans, 1)
     number("tolerance", tolerance, 0, "Give a positive number")
-    for argument, bound in (("lower", lower), ("upper", upper)):
-        require_shape(argument, bound, (mpc.system.n,), "Give a number for each state")
-        require_finite(argument, bound)
+    require_box(mpc, lower, upper)
     with jax.enable_x64(True):
         lower, upper = host_array("lower", lower), host_array("upper", upper)
         fixed = Controller(mpc, replace(solver, newton_steps=0, eps=tolerance))
         precise = Controller(mpc, ADMM())
-        starts = np.random.default_rng(seed).uniform(lower, upper, (50 * LOOPS, len(lower)))
-        status = jax.jit(jax.vmap(lambda x: precise(x).plan.status))(starts)
-        starts = starts[np.argsort(np.asarray(status) != Status.SOLVED, kind="stable")[:LOOPS]]
+        starts = starting_states(precise, lower, upper, seed)
         A, B = (jnp.asarray(host_array("system", v)) for v in (mpc.system.A, mpc.system.B))
         drift = 0.0 if mpc.system.c is None else jnp.asarray(host_array("system.c", mpc.system.c))
 

@@ -12,7 +12,7 @@ import pytest
 
 import jaxmpc as jm
 from jaxmpc.closed_loop import Disturbance, KalmanFilter, OffsetFreeController, augmented
-from jaxmpc.export import check_fixed_steps, export_c
+from jaxmpc.export import check_fixed_steps, choose_steps, export_c
 
 CC = shutil.which("cc")
 compiled = pytest.mark.skipif(CC is None, reason="there is no C compiler")
@@ -208,3 +208,33 @@ def test_an_offset_free_loop(tmp_path):
             x = np.array([[0.85, 0.12], [0.02, 0.83]]) @ x + np.array([0.01, 0.4]) * u + 0.02
             z = A_d @ z + B_d @ u
     assert np.max(inputs) == 1 and abs(x[0] - 1) < 1e-6
+
+
+@pytest.mark.slow
+def test_chosen_steps_solve_most_plans():
+    """On closed loops other than those of the search; a penalty for each kind of row."""
+    mpc = CHECKED
+    box = [-1.0, -1.0], [1.0, 1.0]
+    solver = choose_steps(mpc, *box, plans=400)
+    found = check_fixed_steps(mpc, solver, *box, 400, seed=7)
+    assert found.solvable > 300 and found.reached >= 0.985 * found.solvable
+    assert len(set(np.asarray(solver.rho).tolist())) <= len(jm.Controller(mpc).condensed.layout)
+    few = choose_steps(mpc, *box, iterations=25, plans=400)
+    assert few.iterations == 25
+    given = check_fixed_steps(mpc, jm.ADMM(iterations=25), *box, 400, seed=7)
+    assert check_fixed_steps(mpc, few, *box, 400, seed=7).reached >= given.reached
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"share": -1.0}, "share: -1.0"),
+        ({"iterations": 0}, "iterations: 0"),
+        ({"lower": [0.0]}, "lower: shape"),
+        ({"plans": 0}, "plans: 0"),
+    ],
+)
+def test_bad_arguments_of_the_search(given, message):
+    arguments = {"lower": [-1.0, -1], "upper": [1.0, 1]} | given
+    with pytest.raises(ValueError, match=message):
+        choose_steps(CHECKED, **arguments)
