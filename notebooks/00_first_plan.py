@@ -13,6 +13,9 @@
 # You will describe a robot joint with its limits, compute one optimal plan with model predictive
 # control (MPC), read its status, and run the controller in a closed loop. At the end you know why
 # a plan can be impossible although the joint is still within all its limits.
+#
+# Lines that begin with `assert` check what the text says, for the numbers as they stand here; when
+# you change a number, one may stop you: it says which sentence no longer holds, and may be deleted.
 
 # %%
 import matplotlib.pyplot as plt

@@ -13,6 +13,9 @@
 # You will turn a small MPC problem into a quadratic program (QP) by hand, solve it, and check with
 # three residuals that the answer is right. You will read the active constraints from the Lagrange
 # multipliers, and verify a proof that another QP has no solution.
+#
+# Lines that begin with `assert` check what the text says, for the numbers as they stand here; when
+# you change a number, one may stop you: it says which sentence no longer holds, and may be deleted.
 
 # %%
 import jax

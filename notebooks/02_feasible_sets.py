@@ -13,6 +13,9 @@
 # From which initial states can an MPC controller keep all its limits? You will map this set for
 # the robot joint, enclose its area between two bounds that meet at 1489/125, and check two of the
 # proofs behind the map yourself, in exact arithmetic.
+#
+# Lines that begin with `assert` check what the text says, for the numbers as they stand here; when
+# you change a number, one may stop you: it says which sentence no longer holds, and may be deleted.
 
 # %%
 import subprocess

@@ -14,6 +14,9 @@
 # is optimal and whose closed loop falls over, and then repair it with a terminal cost and a
 # terminal set. You will check the hypotheses of the stability theorem and watch the optimal cost
 # decrease along the closed loop.
+#
+# Lines that begin with `assert` check what the text says, for the numbers as they stand here; when
+# you change a number, one may stop you: it says which sentence no longer holds, and may be deleted.
 
 # %%
 import jax

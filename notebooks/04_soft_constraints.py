@@ -13,6 +13,9 @@
 # A controller must do something even where no plan keeps all limits. You will soften the limits of
 # the robot joint with slack variables, and see that a penalty that is too small gives limits away
 # that could be kept. Then you will compute the exact threshold from which this cannot happen.
+#
+# Lines that begin with `assert` check what the text says, for the numbers as they stand here; when
+# you change a number, one may stop you: it says which sentence no longer holds, and may be deleted.
 
 # %%
 import jax

@@ -16,6 +16,9 @@
 # A plan that exists now need not exist at the next sample. You will learn how to refute the
 # recursive feasibility of a controller by a counterexample, how to prove it by a longer horizon
 # or by a terminal set, and how to draw the states that are lost.
+#
+# Lines that begin with `assert` check what the text says, for the numbers as they stand here; when
+# you change a number, one may stop you: it says which sentence no longer holds, and may be deleted.
 
 # %%
 from dataclasses import replace

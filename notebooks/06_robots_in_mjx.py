@@ -16,6 +16,9 @@
 # You will load a two-link arm, read its limits from the model file, make an MPC for it, and run 64
 # closed loops at once in MuJoCo's simulator MJX. You will see which limits are kept on the
 # *nonlinear* robot, and why the reference of the input matters as much as that of the state.
+#
+# Lines that begin with `assert` check what the text says, for the numbers as they stand here; when
+# you change a number, one may stop you: it says which sentence no longer holds, and may be deleted.
 
 # %%
 import matplotlib.pyplot as plt

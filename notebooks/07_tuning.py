@@ -17,6 +17,9 @@
 # constraints, the solver and all samples, and see how a badly chosen loss deceives. You will also
 # keep apart two numbers that are both called $\rho$: the weight of soft limits, which is part
 # of the *problem*, and the step size of ADMM, which is part of the *solver*.
+#
+# Lines that begin with `assert` check what the text says, for the numbers as they stand here; when
+# you change a number, one may stop you: it says which sentence no longer holds, and may be deleted.
 
 # %%
 from dataclasses import replace
@@ -88,7 +91,8 @@ assert angle(after)[10] < angle(before)[10]
 # %%
 hundredth = replace(guess, Q=guess.Q / 100, R=guess.R / 100)
 fooled = jm.simulate_many(jm.Controller(hundredth), system, x0s, steps)
-own = {"first guess": before.stage_cost.mean(), "a hundredth of it": fooled.stage_cost.mean()}
+own = {"first guess": before, "a hundredth of it": fooled}
+own = {name: round(float(runs.stage_cost.mean()), 6) for name, runs in own.items()}
 print("the controller's own cost:", own)
 true_loss = lambda r: float(np.mean(jax.vmap(loss)(r)))
 ours = {"first guess": before, "a hundredth of it": fooled, "tuned": after}
@@ -124,7 +128,8 @@ exact = jm.explicit.exact_penalty(cart)
 factors = np.array([0.1, 0.5, 0.9, 0.99, 1.01, 2.0])
 worst = np.array([0.999999 * exact.at])  # a hair inside the feasible set
 slack = [jm.solve_many(jm.soften(cart, rho=f * exact.rho_bar), worst).slack.max() for f in factors]
-print("threshold:", exact.rho_bar, " slack:", dict(zip(factors, np.round(slack, 6), strict=True)))
+print(f"threshold: {exact.rho_bar:.6g}")
+print("slack by factor:", ", ".join(f"{f}: {s:.6f}" for f, s in zip(factors, slack, strict=True)))
 assert np.isclose(exact.rho_bar, 11.25)
 assert min(slack[:3]) > 1e-4 and max(slack[4:]) < 1e-5
 
@@ -146,7 +151,7 @@ for rho in rhos:
     plans = jax.vmap(jm.Controller(run.mpc, admm).plan)(states)
     accuracy.append(np.maximum(plans.primal_residual, plans.dual_residual))
     solved.append(np.mean(plans.solved))
-print("solved, by rho:", dict(zip(np.round(rhos, 3), np.round(solved, 3), strict=True)))
+print("solved, by rho:", ", ".join(f"{r:.3g}: {s:.3f}" for r, s in zip(rhos, solved, strict=True)))
 
 # %%
 fig, (left, right) = plt.subplots(1, 2, figsize=(8, 3.2))

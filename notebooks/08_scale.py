@@ -17,6 +17,9 @@
 # by `solve_many`, and label a million states as feasible or not, with proofs. You will count what
 # became of each state, measure the throughput on your own machine, and compare
 # float32 with float64.
+#
+# Lines that begin with `assert` check what the text says, for the numbers as they stand here; when
+# you change a number, one may stop you: it says which sentence no longer holds, and may be deleted.
 
 # %%
 from time import perf_counter

@@ -16,6 +16,9 @@
 # A load that nobody measures pushes a joint. You will learn how to say so, how much of it the
 # limits can take, how to get a controller that keeps them whatever the load does, how to prove that
 # it always has a plan, and how to write it as C code.
+#
+# Lines that begin with `assert` check what the text says, for the numbers as they stand here; when
+# you change a number, one may stop you: it says which sentence no longer holds, and may be deleted.
 
 # %%
 import tempfile
