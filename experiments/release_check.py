@@ -1,6 +1,6 @@
 """Compare what was built with the source tree: nothing of the package may be missing.
 
-    python -m build && python experiments/release_check.py dist
+python -m build && python experiments/release_check.py dist
 """
 
 import subprocess
