@@ -59,8 +59,8 @@ def evaluate_runs(
 
     run: from `simulate` or `simulate_many`, with or without a batch axis. plant: the Robot or
     LinearPlant whose limits count, without margin. reference (n,): the set-point, in coordinates.
-    tolerance: the band, as a fraction of each coordinate's `Box.half_widths`. Raises ValueError
-    for other shapes.
+    tolerance: the band, as a fraction of each coordinate's `Box.half_widths`; a robot's velocity
+    without limits has none, since nobody said what is slow. Raises ValueError for other shapes.
     """
     run = run.on_host()
     require_shape("reference", reference, (plant.n,), "The set-point, in coordinates")
@@ -69,6 +69,10 @@ def evaluate_runs(
         fail("tolerance", f"{tolerance}", "Give a positive fraction")
     limits = with_limits(plant, run)
     xi, band = limits[0][1], tolerance * plant.state_limits.half_widths()
+    if isinstance(plant, Robot):
+        lower, upper = plant.state_limits.bounds()
+        velocities = np.arange(plant.n) >= plant.mujoco.nv
+        band = np.where(velocities & np.isinf(lower) & np.isinf(upper), np.inf, band)
     inside = (np.abs(xi - host_array("reference", reference)) <= band).all(axis=2)
     # Time steps before the last stretch inside: T + 1 less its length.
     before = inside.shape[1] - np.cumprod(inside[:, ::-1], axis=1).sum(axis=1)

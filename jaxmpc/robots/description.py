@@ -80,6 +80,7 @@ class RobotDescription:
     numbers: dict[str, Any] = field(default_factory=dict)
     notes: tuple[tuple[str, str], ...] = static(default=())
     file: Any = static(default=None)
+    shapes: Any = static(default=None)
 
     @property
     def mujoco(self) -> "mujoco.MjModel":

@@ -21,7 +21,8 @@ from jaxmpc.sets.limits import row_violations, rows_kept
 # The target has the colour of set-points in the plots; red is for limits alone.
 INK, PAPER, RED, TARGET = (40, 40, 40), (255, 255, 255), (200, 20, 20), (0, 158, 115)
 OPACITY = 0.3  # of the target
-# Grey of what a model without a skybox leaves black.
+# Grey of what a model without a skybox leaves black, and colour of capsules in place of shapes.
+LINK = np.array([0.75, 0.75, 0.8, 1], np.float32)
 BACKGROUND = np.array([0.5, 0.5, 0.5, 1], np.float32)
 
 
@@ -46,7 +47,7 @@ def render(
     each tile; None for none. every: states from one frame to the next. width, height: pixels of a
     tile. camera: the name of one of the model's; None, or "view" where the model has none of that
     name, for a camera that sees all that moves, at all times. What a model without a skybox leaves
-    black is grey.
+    black is grey; bodies without shapes are capsules from joint to joint.
 
     labels: write the robot's name and the time in s above, a legend below, and numbers on the
     tiles. numbers: those of the robots, None: from 0.
@@ -65,7 +66,7 @@ def render(
     count, samples = motions.shape[:2]
     if numbers is not None and len(numbers) != count:
         fail("numbers", f"{len(numbers)} of {count} robots", "Give one for each")
-    model = _drawn(robot.mujoco, width, height)
+    model = _drawn(robot.mujoco if robot.shapes is None else robot.shapes, width, height)
     view: Any = camera
     if camera is not None and number_of(model, "camera", camera) < 0:
         if camera != "view":
@@ -171,6 +172,7 @@ def _draw(
         data.qpos[:] = q
         mujoco.mj_forward(model, data)
         renderer.update_scene(data, view)
+        _add_links(renderer.scene, model, data)
         if target is not None:
             ghost.qpos[:] = target[k]
             mujoco.mj_forward(model, ghost)
@@ -200,20 +202,51 @@ def _camera(model: "mujoco.MjModel", poses: np.ndarray, aspect: float) -> "mujoc
     camera, data = mujoco.MjvCamera(), mujoco.MjData(model)
     mujoco.mjv_defaultFreeCamera(model, camera)
     moving = (model.body_weldid[model.geom_bodyid] != 0) & (model.geom_rbound > 0)
-    if not np.any(moving):
-        return camera
     size, ends = model.geom_rbound[moving, None], []
     for pose in poses:
         data.qpos[:] = pose
         mujoco.mj_kinematics(model, data)
         at = data.geom_xpos[moving]
-        ends += [(at - size).min(axis=0), (at + size).max(axis=0)]
+        links = np.array([end for pair in _links(model, data) for end in pair]).reshape(-1, 3)
+        points = np.concatenate([at - size, at + size, links])
+        if len(points):
+            ends += [points.min(axis=0), points.max(axis=0)]
+    if not ends:
+        return camera
     lower, upper = np.min(ends, axis=0), np.max(ends, axis=0)
     half = np.deg2rad(model.vis.global_.fovy) / 2
     narrow = min(half, np.arctan(np.tan(half) * aspect))
     camera.lookat[:] = (lower + upper) / 2
     camera.distance = 0.5 * np.linalg.norm(upper - lower) / np.sin(narrow)
     return camera
+
+
+def _links(model: "mujoco.MjModel", data: "mujoco.MjData") -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return the ends of a line for each body without shapes of its own that moves: from its joint
+    to the next ones, from that of a last body to its centre of mass and as far beyond."""
+    found = []
+    for body in range(1, model.nbody):
+        if model.body_geomnum[body] or not model.body_weldid[body]:
+            continue
+        at = data.xpos[body]
+        later = np.flatnonzero(model.body_parentid == body)
+        ends = [data.xpos[child] for child in later if child != body]
+        found += [(at, end) for end in ends or [2 * data.xipos[body] - at]]
+    return found
+
+
+def _add_links(scene: "mujoco.MjvScene", model: "mujoco.MjModel", data: "mujoco.MjData") -> None:
+    """Add a capsule for each body without shapes."""
+    links = _links(model, data)
+    longest = max((float(np.linalg.norm(b - a)) for a, b in links), default=0.0)
+    for a, b in links:
+        if scene.ngeom == scene.maxgeom or not np.any(a != b):
+            continue
+        capsule, kind = scene.geoms[scene.ngeom], mujoco.mjtGeom.mjGEOM_CAPSULE
+        mujoco.mjv_initGeom(capsule, kind, np.zeros(3), np.zeros(3), np.eye(3).ravel(), LINK)
+        mujoco.mjv_connector(capsule, kind, 0.08 * longest, a, b)
+        capsule.category = mujoco.mjtCatBit.mjCAT_DYNAMIC
+        scene.ngeom += 1
 
 
 def _add_ghost(scene: "mujoco.MjvScene", model: "mujoco.MjModel", data: "mujoco.MjData") -> None:
@@ -224,6 +257,7 @@ def _add_ghost(scene: "mujoco.MjvScene", model: "mujoco.MjModel", data: "mujoco.
     """
     first, moving = scene.ngeom, mujoco.mjtCatBit.mjCAT_DYNAMIC.value
     mujoco.mjv_addGeoms(model, data, mujoco.MjvOption(), mujoco.MjvPerturb(), moving, scene)
+    _add_links(scene, model, data)
     eye = (scene.camera[0].pos + scene.camera[1].pos) / 2
     for geom in scene.geoms[first : scene.ngeom]:
         geom.rgba[:] = [*(v / 255 for v in TARGET), OPACITY]

@@ -31,6 +31,7 @@ from jaxmpc.robots.mujoco_access import (
 )
 from jaxmpc.robots.physics import RK4, Physics
 from jaxmpc.robots.robot import Robot
+from jaxmpc.robots.urdf_shapes import compiled_shapes, drawable
 from jaxmpc.sets.convex_sets import Box
 from jaxmpc.sets.limits import Limit, limit_pair
 from jaxmpc.systems.system import require_period
@@ -49,6 +50,7 @@ def load_robot(
     timestep: float | None = None,
     floating_base: bool = False,
     mend_inertias: bool = False,
+    motors: bool = False,
 ) -> Robot:
     """Load a robot: a model of ours, an MJCF or URDF file, or a mujoco.MjModel.
 
@@ -56,8 +58,8 @@ def load_robot(
         model: "joint" (one hinge), "pendulum", "cartpole", "arm2", "arm6" (UR5e), "arm7" (Franka
             FER), "quadrotor" (Crazyflie 2), or a path. A URDF gets a motor for each joint that
             mimics no other, with its `effort` as limit, its `velocity` limits are read (0 of
-            either: none), and its shapes are left out: it must give inertias, has no contacts,
-            needs no mesh files.
+            either: none), and its shapes are for pictures alone: it must give inertias, has no
+            contacts, needs no mesh files.
         position, velocity, torque: limits in place of the file's, as `joint_limits` takes them:
             (lower, upper), each a number or one a dof (torque: one an actuator), or v for
             |.| ≤ v, inputs in units of ctrl. They bind the controller; the joint stops of the plant
@@ -70,6 +72,8 @@ def load_robot(
         mend_inertias: of a URDF, whether inertias that no body can have (principal moments that are
             not positive or violate a + b ≥ c, moving links without mass) are replaced by near ones,
             which `report` lists. Without it they are refused.
+        motors: of an MJCF file without actuators, whether each hinge and slide joint that follows
+            no other gets a motor of gear 1, with the joint's `actuatorfrcrange` as limit.
 
     Defaults where the file lacks `<numeric name="velocity_limit">`, `<numeric name=
     "control_period">` and `<key name="home">`: none, 10 ms (rounded to physics steps), and the
@@ -92,7 +96,7 @@ def load_robot(
     """
     require_package("mujoco", "robots")
     _compare_versions()
-    file = _opened(model, floating_base, mend_inertias)
+    file = _opened(model, floating_base, mend_inertias, motors)
     host, name = file.model, file.name
     _require_plant(host, name)
     substeps, period = _periods(host, control_period, timestep)
@@ -131,6 +135,7 @@ def load_robot(
         input_limits=limits,
         home=start,
         file=given,
+        shapes=file.shapes,
         plant=plant,
         predictor=Physics(smooth),
         anchor=_anchor(host, q),
@@ -147,7 +152,8 @@ def load_robot(
 
 class _File(NamedTuple):
     """A copy of the compiled model, its name, of a URDF the velocity limits by joint, what was
-    mended, and whether its root link is welded to the world, and shapes whose files are missing."""
+    mended, and whether its root link is welded to the world, shapes whose files are missing, and
+    the model of its shapes."""
 
     model: "mujoco.MjModel"
     name: str
@@ -155,16 +161,20 @@ class _File(NamedTuple):
     mended: tuple[str, ...]
     welded: bool
     lost: tuple[str, ...] = ()
+    shapes: "mujoco.MjModel | None" = None
 
 
 def _opened(
-    model: "str | Path | mujoco.MjModel", floating_base: bool, mend_inertias: bool
+    model: "str | Path | mujoco.MjModel", floating_base: bool, mend_inertias: bool, motors: bool
 ) -> _File:
     """Return what `load_robot` is given, compiled. Raises ValueError for what cannot be read."""
     urdf = isinstance(model, str | Path) and _is_urdf(model)
     for argument, given in (("floating_base", floating_base), ("mend_inertias", mend_inertias)):
         if given and not urdf:
             fail(argument, "is for URDF files", "Write it into the MJCF file or the MjModel")
+    if motors and (urdf or isinstance(model, mujoco.MjModel)):
+        what = "a URDF, which gets motors anyway" if urdf else "a compiled model"
+        fail("motors", f"given with {what}", "Leave it out, or give an MJCF file")
     if isinstance(model, mujoco.MjModel):
         return _File(copy.deepcopy(model), "robot", {}, (), False)
     if not isinstance(model, str | Path):
@@ -174,15 +184,32 @@ def _opened(
         path = Path(str(resources.files("jaxmpc.robots"))) / "models" / f"{model}.xml"
     elif not path.is_file():
         fail("model", f"{str(model)!r} is no file", f"Give a path, or one of {', '.join(MODELS)}")
+    own = _actuators(path) if motors else 0
+    if own:
+        fail("motors", f"given, and {path.name} has {own} actuators of its own", "Leave it out")
     try:
         if not urdf:
-            host, lost = compiled_mjcf(path)
+            host, lost = compiled_mjcf(path, motors)
             return _File(host, path.stem, {}, (), False, lost)
-        host, velocities, mended = compiled_urdf(path.read_text(), floating_base, mend_inertias)
-        return _File(host, path.stem, velocities, mended, welded=not floating_base)
+        welded = not floating_base
+        root = ElementTree.fromstring(path.read_text())
+        drawn = drawable(root, path.resolve().parent)
+        host, velocities, mended = compiled_urdf(root, floating_base, mend_inertias)
+        if floating_base:
+            _free(drawn)
+        shapes = compiled_shapes(drawn)
+        return _File(host, path.stem, velocities, mended, welded, shapes=shapes)
     except (ValueError, ElementTree.ParseError) as error:
         text = " ".join(str(error).split())
         fail("model", f"{path} cannot be read: {text.rstrip('.')}", "Mend the file")
+
+
+def _actuators(path: Path) -> int:
+    """Return the number of actuators of an MJCF file, 0 where it cannot be read."""
+    try:
+        return len(mujoco.MjSpec.from_file(str(path)).actuators)
+    except ValueError:
+        return 0
 
 
 def _require_plant(host: "mujoco.MjModel", name: str) -> None:
@@ -190,7 +217,7 @@ def _require_plant(host: "mujoco.MjModel", name: str) -> None:
     if host.nv == 0:
         fail("model", f"{name} has no joints", "A robot has something to move")
     if host.nu == 0:
-        cure = "Add <actuator><motor joint=.../></actuator>; a URDF file gets motors"
+        cure = "Load the file with motors=True, or add <actuator><motor joint=.../></actuator>"
         fail("model", f"{name} has no actuators", cure)
     if host.na and host.opt.integrator == RK4:
         problem = f"{name} has {host.na} activation states and the integrator RK4"
@@ -429,13 +456,19 @@ def overridden(argument: str, limits: Box, override: Limit, part: slice) -> Box:
     return Box(lower, upper)
 
 
-def compiled_mjcf(path: Path) -> "tuple[mujoco.MjModel, tuple[str, ...]]":
-    """Return an MJCF file, compiled, and what was left out because files are missing.
+def compiled_mjcf(path: Path, motors: bool = False) -> "tuple[mujoco.MjModel, tuple[str, ...]]":
+    """Return an MJCF file, compiled, and what was left out because files are missing; motors:
+    whether its joints get some.
 
     Shapes whose meshes are missing are left out where their bodies have inertias of their own, and
     textures that are missing. Raises ValueError where a body's mass is that of such a shape.
     """
     spec, lost = None, list[str]()
+    if motors:
+        spec = mujoco.MjSpec.from_file(str(path))
+        joint = mujoco.mjtEq.mjEQ_JOINT
+        followers = {equality.name1 for equality in spec.equalities if equality.type == joint}
+        _add_motors(spec, followers)
     while True:
         try:
             if spec is None:
@@ -482,14 +515,13 @@ _AXES = ("xx", "xy", "xz", "yy", "yz", "zz")
 
 
 def compiled_urdf(
-    text: str, floating_base: bool, mend_inertias: bool
+    root: ElementTree.Element, floating_base: bool, mend_inertias: bool
 ) -> "tuple[mujoco.MjModel, dict[str, float], tuple[str, ...]]":
     """Return a URDF, compiled, the velocity limit of each joint, and what was mended.
 
     Visual and collision geometry is left out, so that no mesh is looked for. Each hinge and slide
-    joint gets a motor, as a URDF cannot have any.
+    joint gets a motor, as a URDF cannot have any. Changes `root`.
     """
-    root = ElementTree.fromstring(text)
     for link in root.iter("link"):
         for kind in ("visual", "collision"):
             for element in link.findall(kind):

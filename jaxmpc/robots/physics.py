@@ -57,7 +57,9 @@ class Physics:
                 self.mjx = self.mjx.replace(**_without_margins(self.mjx))
                 blank = mjx.make_data(model, impl="jax")
         except NotImplementedError as error:
-            fail("model", f"MJX does not support it: {error}", "Take that out of the file")
+            integrator = "mjINT_IMPLICIT" in str(error)
+            cure = 'Write integrator="implicitfast"' if integrator else "Take that out of the file"
+            fail("model", f"MJX does not support it: {error}", cure)
         self.rows = blank._impl.efc_J.size > 0
         self.tamed = TAMED if self.rows or model.ntendon else {}
         placed = blank._impl.contact.dim.size or np.any(model.eq_type != EQUALITY_OF_JOINTS)

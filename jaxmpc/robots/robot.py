@@ -56,7 +56,8 @@ class Robot(RobotDescription):
     anchor (nq,): zeros, with the orientations of home. plant, predictor: `Physics`, constants of
     compiled programs (twice to ten times as fast as arguments). numbers: parameters of the plant
     that differ in a batch (masses, damping), see `vary`. notes: (kind, text) of what `load_robot`
-    found, see `report`. file: the mujoco.MjModel as it was given.
+    found, see `report`. file: the mujoco.MjModel as it was given. shapes:
+    the mujoco.MjModel to draw, where that is another one: a URDF's with its shapes.
     """
 
     def step(self, x: Any, u: Any) -> Array:

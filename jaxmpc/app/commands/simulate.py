@@ -75,7 +75,8 @@ class Simulate:
 
     How to read the table
       success        robots that kept all limits and ended at the target: each coordinate within
-                     --tolerance of half its range (limits' half-width; 1 where it has none)
+                     --tolerance of half its range (limits' half-width; 1 where it has none, and
+                     any velocity where velocities have none)
       limits kept    robots with all states and inputs within the limits at all time steps, to 1e-6
                      (1e-6 of the limit, where that is above 1). The margin is not counted in.
       plans valid    robots all of whose plans were solved without fallback; how many kept limits
