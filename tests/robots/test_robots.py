@@ -561,7 +561,7 @@ def test_contacts_act_in_the_plant_only():
 BAD_FILES = {
     "broken": ("<mujoco><worldbody>", {}, r"model: .*robot.xml cannot be read: .*Mend the file"),
     "no actuators": (
-        single(actuator=""), {}, r"model: robot has no actuators\. Add <actuator>",
+        single(actuator=""), {}, r"model: robot has no actuators\. Load .*motors=True",
     ),
     "no joints": (
         '<mujoco><worldbody><geom size="1"/></worldbody></mujoco>', {}, "model: .* has no joints",
@@ -571,7 +571,7 @@ BAD_FILES = {
         "model: .* 1 activation states and the integrator RK4. Use another integrator",
     ),
     "integrator": (
-        single('integrator="implicit"'), {}, "model: MJX does not support it: .*IMPLICIT.*Take",
+        single('integrator="implicit"'), {}, "model: MJX does not support it: .*IMPLICIT.*fast",
     ),
     "forces": (
         single(actuator='<motor joint="a" ctrlrange="1 2" forcerange="-.5 .5"/>'), {},
