@@ -4,14 +4,16 @@ import ast
 import contextlib
 import importlib
 import io
+import json
 import os
 import re
 import shlex
 import signal
 import sys
+import time
 import types
 from collections.abc import Iterator, Sequence
-from dataclasses import fields, make_dataclass
+from dataclasses import dataclass, fields, make_dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
@@ -34,7 +36,15 @@ COMMANDS = {
     "export": ("export", "Export"),
     "report": ("report", "Report"),
 }
-DESCRIPTION = "Constrained MPC in batches, with proofs. Also: jaxmpc --version"
+DESCRIPTION = """Constrained MPC in batches, with proofs. Also: jaxmpc --version
+
+Every command takes --quiet (errors alone), --json (one JSON object in place of tables) and
+--format {pdf,svg,png} (pictures in this format beside PNG). docs/how-to/commands.md tells more."""
+# Formats of pictures, and the files in which commands keep their results as JSON.
+FORMATS = ("pdf", "svg", "png")
+RECORDS = ("summary.json", "tuning.json", "solver.json")
+# What the line of an error begins with.
+ERROR = "jaxmpc: error: "
 # Options of tyro that write a completion script for a shell, and the words that each needs.
 COMPLETIONS = {"--tyro-print-completion": 2, "--tyro-write-completion": 3}
 TUNE = "Learn what is usually guessed: an MPC's weights, or the penalties of its solver."
@@ -45,6 +55,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run a command and return its exit code: 0 done, 2 error, 130 interrupted, 141 nobody reads
     its output any more."""
     argv = list(sys.argv[1:] if argv is None else argv)
+    everywhere = Everywhere()
     for stream in (sys.stdout, sys.stderr):  # what their encoding lacks becomes "?"
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
@@ -52,13 +63,78 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"jaxmpc {jaxmpc.__version__}")
         return 0
     try:
-        command = parse(argv)
+        everywhere, words = options_of_all(argv)
+        command = parse(words)
     except BrokenPipeError:
         return without_reader()
     except (ValueError, OSError, AssertionError) as error:  # tyro asserts that it knows a shell
         return report_error(str(error))
-    with plain_output():
-        return run(command, argv)
+    if everywhere.format is not None:
+        import matplotlib
+
+        matplotlib.rcParams["savefig.format"] = everywhere.format
+    if not (everywhere.quiet or everywhere.json):
+        with plain_output():
+            return run(command, argv)
+    said, begun = io.StringIO(), time.time()
+    with plain_output(said, OnlyErrors(sys.stderr)):
+        code = run(command, argv)
+    if everywhere.json:
+        print(json.dumps(as_json(command, words, code, said.getvalue(), begun), indent=2))
+    return code
+
+
+@dataclass(frozen=True)
+class Everywhere:
+    """Options that every command takes.
+
+    quiet: print errors alone. json: print one JSON object in place of tables. format: of pictures,
+    beside PNG; None for PNG alone.
+    """
+
+    quiet: bool = False
+    json: bool = False
+    format: str | None = None
+
+
+def options_of_all(argv: Sequence[str]) -> tuple[Everywhere, list[str]]:
+    """Return the options that every command takes, and the other words. Raises ValueError for a
+    format that there is not."""
+    found: dict[str, Any] = {}
+    rest, words = list[str](), list(argv)
+    while words:
+        word = words.pop(0)
+        name, equals, value = word.partition("=")
+        if word in ("--quiet", "--json"):
+            found[word[2:]] = True
+        elif name == "--format":
+            value = value if equals else words.pop(0) if words else "no value"
+            if value not in FORMATS:
+                fail("--format", value, f"Give one of {', '.join(FORMATS)}")
+            found["format"] = None if value == "png" else value
+        else:
+            rest.append(word)
+    return Everywhere(**found), rest
+
+
+def as_json(
+    command: Any, words: Sequence[str], code: int, said: str, begun: float
+) -> dict[str, Any]:
+    """Return what a command came to: its exit code, the lines that it printed, and what it wrote
+    as JSON into its folder since `begun`."""
+    folder = getattr(command, "output", None)
+    summary = None
+    for name in RECORDS if folder is not None else ():
+        path = Path(folder) / name
+        if path.is_file() and path.stat().st_mtime >= begun - 1:
+            summary = json.loads(path.read_text(encoding="utf-8"))
+    return {
+        "command": " ".join(words[: 2 if words[:1] == ["tune"] else 1]),
+        "exit_code": code,
+        "output": None if folder is None else str(folder),
+        "lines": said.splitlines(),
+        "summary": summary,
+    }
 
 
 def run(command: Any, argv: Sequence[str]) -> int:
@@ -219,16 +295,34 @@ class Plain:
         return getattr(self._stream, name)
 
 
+class OnlyErrors:
+    """A stream of which only the lines of `report_error` are seen, no progress."""
+
+    def __init__(self, stream: Any) -> None:
+        self._stream, self._line = stream, ""
+
+    def write(self, text: str) -> int:
+        """Take a text, and write the lines that it ends, if they are errors."""
+        *lines, self._line = (self._line + text).split("\n")
+        for line in lines:
+            if line.startswith(ERROR):
+                self._stream.write(line + "\n")
+        return len(text)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
 @contextlib.contextmanager
-def plain_output() -> Iterator[None]:
-    """Let all that is printed pass through `Plain`."""
-    out: Any = Plain(sys.stdout)
-    err: Any = Plain(sys.stderr)
+def plain_output(out: Any = None, err: Any = None) -> Iterator[None]:
+    """Let all that is printed pass through `Plain`, to these streams in place of the usual ones."""
+    out = Plain(sys.stdout if out is None else out)
+    err = Plain(sys.stderr if err is None else err)
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         yield
 
 
 def report_error(message: str) -> int:
     """Print one line on stderr and return the exit code, 2."""
-    print(f"jaxmpc: error: {printable(' '.join(message.split()))}", file=sys.stderr)
+    print(f"{ERROR}{printable(' '.join(message.split()))}", file=sys.stderr)
     return 2

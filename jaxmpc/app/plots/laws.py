@@ -31,8 +31,9 @@ def plot_regions(
 ) -> Axes:
     """Draw the critical regions of two parameters, with the law or the value on them.
 
-    show: "regions" colours each by the number of its active rows, "law" by the output of this
-    number, such as the first input, "value" by the least cost. axes: the two parameters. fixed
+    regions: of `critical_regions`.
+    show: "regions" colours each by the number of its active rows, "law" by an output, such as the
+    first input, "value" by the least cost. output: the number of that output. axes: the two parameters. fixed
     (p,): values of the others, for a slice; None: zero. limits ((low, high), (low, high)): of the
     picture; None: around the vertices of all regions. Without `ax` a new figure is made.
 

@@ -181,9 +181,11 @@ def plot_recursion(
     Samples are coloured by the step of the closed loop at which the problem is proved infeasible.
     The line round them is the feasible set X_N. The arrow leads from the counterexample to its
     next state; the dashed line is the half-space that holds on all of X_N and excludes it.
+
+    report: of `recursive_feasibility`.
     enlarge: show the neighbourhood of the counterexample, with X_N filled and without samples.
-    X_N is filled also where there are no samples.
-    Without `ax` a new figure is made. Raises ValueError for other than two states, and for
+
+    X_N is filled also where there are no samples. Without `ax` a new figure is made. Raises ValueError for other than two states, and for
     enlarge without a counterexample.
     """
     if report.loops.x0s.shape[1] != 2:

@@ -24,7 +24,9 @@ SET_POINT: Style = {"color": TERMINAL, "lw": 1.0, "ls": (0, (4, 2))}
 def save(figure: Any, path: Path | BinaryIO, name: str = "") -> None:
     """Write a figure, cut to its content. name: of the system, put before the first title.
 
-    Letters that the usual font lacks are drawn with fonts that are installed and have them.
+    Letters that the usual font lacks are drawn with fonts that are installed and have them. Where
+    Matplotlib's savefig.format is "pdf" or "svg", the picture is written beside it in that format;
+    one of an earlier run in another format is removed.
     """
     if name and (title := figure.axes[0].get_title(loc="left")):
         text = f"{name}: {title[0].lower()}{title[1:]}"
@@ -33,7 +35,13 @@ def save(figure: Any, path: Path | BinaryIO, name: str = "") -> None:
     families = [*rcParams["font.sans-serif"][:1], *_fonts_for("".join(t.get_text() for t in texts))]
     for found in texts:
         found.set_fontfamily(families)
-    figure.savefig(path, dpi=150, bbox_inches="tight", pad_inches=0.15)
+    figure.savefig(path, format="png", dpi=150, bbox_inches="tight", pad_inches=0.15)
+    for suffix in ("pdf", "svg") if isinstance(path, Path) else ():
+        beside = path.with_suffix(f".{suffix}")
+        if rcParams["savefig.format"] == suffix:
+            figure.savefig(beside, bbox_inches="tight", pad_inches=0.05)
+        else:
+            beside.unlink(missing_ok=True)
 
 
 def _fonts_for(text: str) -> list[str]:

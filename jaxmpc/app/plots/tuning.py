@@ -35,9 +35,10 @@ def plot_tuning(
     """Draw a `Descent` of weights in four panels over its T steps.
 
     Loss of the steps and of the validation loops, each relative to its first value where that is
-    positive, the best of them marked; norm of the gradient;
-    `weights`, group → entry → positive values (T+1,), relative to the start; fractions of
-    the validation plans and loops where something went wrong. Red crosses: rejected steps.
+    positive, the best of them marked; norm of the gradient; weights relative to the start; fractions
+    of the validation plans and loops where something went wrong. Red crosses: rejected steps.
+
+    history: of a `TuningRun`. weights: group → entry → positive values (T+1,).
     """
     figure = Figure(figsize=(11, 6.6), layout="constrained")
     ((top, norm), (ratio, counts)) = figure.subplots(2, 2)
@@ -151,7 +152,10 @@ def _draw_weights(
 
 
 def plot_maps(before: FeasibleSetMap, after: FeasibleSetMap) -> Figure:
-    """Draw the proved inner bounds of the feasible sets of two states, before and after."""
+    """Draw the proved inner bounds of the feasible sets of two states, before and after.
+
+    before, after: maps of `map_feasible_set(...).refine()`.
+    """
     figure = Figure(figsize=(7.6, 4.6), layout="constrained")
     ax = figure.add_subplot()
     for fmap, name, colour, dashes in (
@@ -176,7 +180,7 @@ def plot_solver(
 ) -> Figure:
     """Draw the penalties of `tune_solver` by kind of row and stage, and the residuals.
 
-    before, after (B,): largest residual of each validation state with the solver that was given
+    run: of `tune_solver`. before, after (B,): largest residual of each validation state with the solver that was given
     and with the tuned one. eps: what counts as solved. Rows of a kind are drawn over the step k
     of the horizon at which they hold, those of one step by their number.
     """
