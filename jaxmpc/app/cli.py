@@ -122,7 +122,7 @@ def as_json(
 ) -> dict[str, Any]:
     """Return what a command came to: its exit code, the lines that it printed, and what it wrote
     as JSON into its folder since `begun`."""
-    folder = getattr(command, "output", None)
+    folder: Any = getattr(command, "output", None)
     summary = None
     for name in RECORDS if folder is not None else ():
         path = Path(folder) / name

@@ -483,10 +483,12 @@ def test_init_writes_a_problem_that_every_command_reads(capsys):
     assert run("init") == 2 and "exists. Add --overwrite" in capsys.readouterr().err
     assert run("init --overwrite") == 0 and run("init --output no/where.toml") == 2
     # Every option that is a comment can be set, but for those that need other data.
-    for word in ("c = ", "rho = ", "control_horizon = ", "lower = ", "upper = "):
+    keys = ("c = ", "rho = ", "control_horizon = ", "[[outputs]]", "C = ", "lower = ", "upper = ")
+    for word in (*keys, "input_rate_limit = ", "input_rate_weight = "):
         text = text.replace(f"# {word}", word)
     Path("all.toml").write_text(text)
-    assert configs.load(Path("all.toml")).mpc.control_horizon == 5
+    found = configs.load(Path("all.toml"))
+    assert found.mpc.control_horizon == 5 and found.outputs[0].rho == 100
 
 
 @pytest.mark.parametrize("words", [["--help"], ["--version"], ["tune", "--help"], ["swep"]])

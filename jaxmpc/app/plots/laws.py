@@ -33,9 +33,10 @@ def plot_regions(
 
     regions: of `critical_regions`.
     show: "regions" colours each by the number of its active rows, "law" by an output, such as the
-    first input, "value" by the least cost. output: the number of that output. axes: the two parameters. fixed
-    (p,): values of the others, for a slice; None: zero. limits ((low, high), (low, high)): of the
-    picture; None: around the vertices of all regions. Without `ax` a new figure is made.
+    first input, "value" by the least cost. output: the number of that output. axes: the two
+    parameters. fixed (p,): values of the others, for a slice; None: zero. limits ((low, high),
+    (low, high)): of the picture; None: around the vertices of all regions. Without `ax` a new
+    figure is made.
 
     Raises ValueError for fewer than two parameters and for wrong arguments.
     """

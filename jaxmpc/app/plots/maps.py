@@ -185,8 +185,8 @@ def plot_recursion(
     report: of `recursive_feasibility`.
     enlarge: show the neighbourhood of the counterexample, with X_N filled and without samples.
 
-    X_N is filled also where there are no samples. Without `ax` a new figure is made. Raises ValueError for other than two states, and for
-    enlarge without a counterexample.
+    X_N is filled also where there are no samples. Without `ax` a new figure is made. Raises
+    ValueError for other than two states, and for enlarge without a counterexample.
     """
     if report.loops.x0s.shape[1] != 2:
         fail("report", f"is of {report.loops.x0s.shape[1]} states", "A plot needs 2")

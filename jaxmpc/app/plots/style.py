@@ -36,7 +36,9 @@ def save(figure: Any, path: Path | BinaryIO, name: str = "") -> None:
     for found in texts:
         found.set_fontfamily(families)
     figure.savefig(path, format="png", dpi=150, bbox_inches="tight", pad_inches=0.15)
-    for suffix in ("pdf", "svg") if isinstance(path, Path) else ():
+    if not isinstance(path, Path):
+        return
+    for suffix in ("pdf", "svg"):
         beside = path.with_suffix(f".{suffix}")
         if rcParams["savefig.format"] == suffix:
             figure.savefig(beside, bbox_inches="tight", pad_inches=0.05)

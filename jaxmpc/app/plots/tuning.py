@@ -35,8 +35,9 @@ def plot_tuning(
     """Draw a `Descent` of weights in four panels over its T steps.
 
     Loss of the steps and of the validation loops, each relative to its first value where that is
-    positive, the best of them marked; norm of the gradient; weights relative to the start; fractions
-    of the validation plans and loops where something went wrong. Red crosses: rejected steps.
+    positive, the best of them marked; norm of the gradient; weights relative to the start;
+    fractions of the validation plans and loops where something went wrong. Red crosses: rejected
+    steps.
 
     history: of a `TuningRun`. weights: group → entry → positive values (T+1,).
     """
@@ -180,9 +181,9 @@ def plot_solver(
 ) -> Figure:
     """Draw the penalties of `tune_solver` by kind of row and stage, and the residuals.
 
-    run: of `tune_solver`. before, after (B,): largest residual of each validation state with the solver that was given
-    and with the tuned one. eps: what counts as solved. Rows of a kind are drawn over the step k
-    of the horizon at which they hold, those of one step by their number.
+    run: of `tune_solver`. before, after (B,): largest residual of each validation state with the
+    solver that was given and with the tuned one. eps: what counts as solved. Rows of a kind are
+    drawn over the step k of the horizon at which they hold, those of one step by their number.
     """
     blocks = [block for block in run.settings["blocks"] if block[2] and block[1]]
     figure = Figure(figsize=(max(3.0 * (len(blocks) + 1.4), 8.0), 4.4), layout="constrained")
