@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxmpc.arrays import Reals
+from jaxmpc.arrays import Reals, host_array
 from jaxmpc.checks import fail, whole
 from jaxmpc.closed_loop.simulation import simulate
 from jaxmpc.mpc.problem import MPC
@@ -40,14 +40,15 @@ def worst_disturbance(
     controller: Any, x0: Reals, steps: int, *, rounds: int = 10, plant: Any = None, seed: int = 0
 ) -> tuple[np.ndarray, float]:
     """Return a sequence (steps, n) of E w that brings a closed loop far beyond its state limits,
-    and how far: the violation in their units, negative by the distance that is left.
+    and how far: the violation in their units, negative by the distance that is left. Of many
+    initial states (B, n) a sequence each (B, steps, n), and the largest violation.
 
     Ascent by gradient: the violation of the simulated loop is differentiated with respect to the
     sequence, and each w moves to the vertex that raises it most, as long as that helps. A local
     search: it finds violations, and proves nothing where there are none.
 
-    controller: of a robust problem with state limits. plant: None for its own model. rounds: at
-    most.
+    controller: of a robust problem with state limits. x0: (n,) or (B, n). plant: None for its
+    own model. rounds: at most.
     """
     mpc = controller.mpc
     W, E = _disturbances(mpc)
@@ -56,23 +57,26 @@ def worst_disturbance(
     steps, rounds = whole("steps", steps, 1), whole("rounds", rounds, 1)
     corners = W.vertices() @ E.T
     plant = mpc.system if plant is None else plant
-    limits = jax.tree.map(lambda v: jnp.asarray(v, controller.dtype), controller.limits)
+    cast = lambda tree: jax.tree.map(lambda v: jnp.asarray(v, controller.dtype), tree)
+    limits = cast(controller.limits)
 
-    def beyond(w: Array) -> Array:
+    def beyond(w: Array, x0: Array) -> Array:
         run = simulate(controller, plant, x0, steps, disturbance=w)
         return jnp.max(jax.vmap(lambda x: _signed(limits, x))(run.states[1:]))
 
-    rise = jax.jit(jax.value_and_grad(beyond))
-    rng = np.random.default_rng(seed)
-    w = corners[rng.integers(len(corners), size=steps)]
-    best, top = w, -np.inf
+    rise = jax.jit(jax.vmap(jax.value_and_grad(beyond)))
+    rng, starts = np.random.default_rng(seed), np.atleast_2d(host_array("x0", x0))
+    w = corners[rng.integers(len(corners), size=(len(starts), steps))]
+    best, top = w, np.full(len(starts), -np.inf)
     for _ in range(rounds):
-        value, slope = rise(jnp.asarray(w, controller.dtype))
-        if not float(value) > top:
+        value, slope = (np.asarray(v, float) for v in rise(*cast((w, starts))))
+        better = value > top
+        if not better.any():
             break
-        best, top = w, float(value)
-        w = corners[np.argmax(np.asarray(slope, float) @ corners.T, axis=1)]
-    return best, top
+        best = np.where(better[:, None, None], w, best)
+        top = np.where(better, value, top)
+        w = corners[np.argmax(slope @ corners.T, axis=2)]
+    return (best[0] if np.ndim(x0) == 1 else best), float(top.max())
 
 
 def _signed(limits: Any, x: Array) -> Array:

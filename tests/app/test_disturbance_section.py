@@ -75,3 +75,54 @@ def test_recursion_command(tmp_path):
     summary = json.loads((output / "summary.json").read_text())
     assert "all disturbances" in json.dumps(summary, ensure_ascii=False)
     assert jm.__version__
+
+
+LOOPS = "simulate --seconds 4 --count 8 --spread 0.9 --config"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("policy", ["tightened", "affine", "tube"])
+def test_simulate_command(tmp_path, monkeypatch, policy, capsys):
+    """Every loop that has a plan keeps all limits under the worst disturbances that are found; the
+    files hold a loop of the plant."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "problem.toml").write_text(
+        TEXT.replace("[disturbance]", f'[disturbance]\npolicy = "{policy}"')
+    )
+    options = "problem.toml --disturbance worst --output out"
+    assert main([*LOOPS.split(), *options.split()]) in (0, None)
+    summary = json.loads((tmp_path / "out/summary.json").read_text())
+    assert summary["policy"] == policy and summary["count"] == 8 and summary["steps"] == 4
+    assert 0 < summary["planned"] == summary["kept"] and summary["plans_solved"] == 1
+    assert "a local search, no proof" in capsys.readouterr().out
+    runs = np.load(tmp_path / "out/runs.npz")
+    x, u, w = (runs[name] for name in ("states", "inputs", "disturbances"))
+    A, B = np.array([[1.0, 1.0], [0.0, 1.0]]), np.array([[0.5], [1.0]])
+    np.testing.assert_allclose(x[:, 1:], x[:, :-1] @ A.T + u @ B.T + w, atol=1e-12)
+    moved = runs["status"][:, 0] == jm.Status.SOLVED
+    np.testing.assert_array_equal(np.unique(np.abs(w[moved])), [0.2])
+    assert moved.sum() == summary["planned"]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ("problem.toml --mass 0.1", "--mass: given beside a problem file"),
+        ("plain.toml --disturbance inside", "--disturbance: inside, and the file has none"),
+        ("free.toml --disturbance inside", "limits.x_min, x_max"),
+        ("problem.toml --horizon 0", "--horizon"),
+    ],
+)
+def test_simulate_refuses(tmp_path, monkeypatch, capsys, options, message):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "problem.toml").write_text(TEXT)
+    (tmp_path / "plain.toml").write_text(TEXT.partition("[disturbance]")[0])
+    free = TEXT.replace("[-5.0, -2.0]", "[-inf, -2.0]").replace('"invariant"', '"none"')
+    (tmp_path / "free.toml").write_text(free)
+    assert main([*LOOPS.split(), *options.split()]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_a_robot_has_no_disturbance(capsys):
+    assert main(["simulate", "--disturbance", "inside"]) == 2
+    assert "--disturbance: given for a robot" in capsys.readouterr().err

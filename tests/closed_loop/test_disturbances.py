@@ -42,6 +42,8 @@ def test_no_sequence_breaks_a_limit():
         strong = jm.Controller(robust(0.2))
         sequence, beyond = worst_disturbance(strong, x0, 6)
         assert sequence.shape == (6, 2) and beyond <= 1e-6
+        both, top = worst_disturbance(strong, np.stack([x0, x0 / 2]), 6)
+        assert both.shape == (2, 6, 2) and top <= beyond + 1e-9
         run = jm.simulate(strong, SYSTEM, x0, 6, disturbance=sequence)
         assert float(run.violation.max()) <= 1e-6 and np.all(run.status == jm.Status.SOLVED)
         for w in draw_disturbances(robust(0.2), 6, 20):

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 import jax
 import numpy as np
 
+from jaxmpc.app import config as configs
 from jaxmpc.app.commands.compile_notice import Compiling
 from jaxmpc.app.commands.options import (
     FINITE,
@@ -26,11 +27,12 @@ from jaxmpc.app.commands.options import (
     Values,
     arguments,
     at_least,
+    given_options,
     option,
     print_table,
     require_lengths,
 )
-from jaxmpc.app.config import load_robot_config
+from jaxmpc.app.commands.simulate_problem import LinearLoops, simulate_problem
 from jaxmpc.batches import chosen_devices
 from jaxmpc.checks import fail, require_disk, require_memory, require_package
 from jaxmpc.closed_loop.feedback import LinearFeedback
@@ -49,6 +51,8 @@ from jaxmpc.robots.robot import Robot
 from jaxmpc.systems.riccati import lqr
 
 FILES = ("summary.json", "runs.png", "robots.gif")
+# Options that go with a problem file.
+LINEAR = "config count seconds spread seed horizon disturbance output overwrite".split()
 # Defaults of options that --config can give too.
 USUAL = {"horizon": 20, "margin": 0.02, "linearize": "state", "rho": 1e4}
 # Seconds between frames of the video.
@@ -90,6 +94,14 @@ class Simulate:
       real time      robot-seconds simulated in a second of wall time; the second number is
                      simulated time by wall time for all robots at once: above 1 is real time
 
+    With --config FILE of a linear problem, one with the section [system]
+      Such as jaxmpc simulate --config problem.toml --disturbance worst
+      Closed loops of its plant and controller, from states in the middle part --spread of the
+      state limits, under disturbances of its section [disturbance]. It counts the starts that have
+      a plan, and of these loops those that kept all limits; neither is a proof. A robust problem
+      keeps them all where its terminal set is invariant: jaxmpc recursion says so.
+      Files: summary.json, and runs.npz with states, inputs, status and disturbances.
+
     Files, all in the folder of --output
       runs.png       Positions, velocities and inputs of some robots over time, limits in grey.
                      Orange: its plan needs slack (fallback). Purple: its plan was not
@@ -114,13 +126,18 @@ class Simulate:
             "FILE",
             "none",
             "TOML file of jaxmpc tune weights --robot: [robot] name, horizon, margin, linearize, "
-            "[cost] Q, R, P, rho. An option given here wins over the file.",
+            "[cost] Q, R, P, rho. An option given here wins over the file. Or a problem file.",
         ),
     ] = None
     count: Annotated[int, option("B", "64"), at_least(1)] = 64
     """Number of robots."""
     seconds: Annotated[float, option("S", "2"), POSITIVE] = 2.0
     """Simulated time of each robot."""
+    disturbance: Annotated[
+        Literal["vertices", "inside", "worst"] | None, option("{vertices,inside,worst}", "none")
+    ] = None
+    """Of a problem file: random vertices of [disturbance], random points of it, or for each start
+    the worst sequence that a search by gradient finds."""
     target: Annotated[
         tuple[float, ...] | None, option("Q [Q ...]", "home of the model"), FINITE
     ] = None
@@ -187,13 +204,19 @@ class Simulate:
 
         Raises ValueError for options and files that make no sense.
         """
+        if self.config is not None and configs.holds_system(self.config):
+            self.of_problem()
+            return
+        if self.disturbance is not None:
+            cure = "Give --config FILE with the sections [system] and [disturbance]"
+            fail("--disturbance", "given for a robot", cure)
         chosen_devices(self.devices, "--devices")
         command = self.settled()
         path = self.output / "runs.zarr"
         check_results(path, self.resume, self.overwrite)
         robot = command.robot_of_file()
         command.require_sizes(robot)
-        file = {} if self.config is None else load_robot_config(self.config).weights(robot)
+        file = {} if self.config is None else configs.load_robot_config(self.config).weights(robot)
         target = None if self.target is None else np.array(self.target)
         reference, input_reference = robot_references(robot, target)
         steps = max(1, round(self.seconds / robot.dt))
@@ -226,6 +249,16 @@ class Simulate:
         files = ["runs.zarr", *self.draw(runs.run, robot, reference, input_reference)]
         rows = [*summary.rows(), ("files", " ".join(str(self.output / name) for name in files))]
         print_table(rows, 13)
+
+    def of_problem(self) -> None:
+        """Simulate a problem file. Raises ValueError for options that are for robots."""
+        for field in dataclasses.fields(self):
+            if field.name not in LINEAR and getattr(self, field.name) != field.default:
+                name = f"--{field.name.replace('_', '-')}"
+                fail(name, "given beside a problem file", "It is for robots: leave it out")
+        config = configs.load(self.config, given_options(self, "horizon"), "simulate")
+        given = self.count, self.seconds, self.spread, self.seed, self.disturbance
+        simulate_problem(LinearLoops(config, *given), self.output, self.overwrite)
 
     def draw(
         self, run: Run, robot: Robot, reference: np.ndarray, input_reference: np.ndarray
@@ -284,7 +317,7 @@ class Simulate:
 
     def settings(self, robot: Robot, mpc: MPC) -> dict[str, Any]:
         """Return the options that determine the results, as JSON data."""
-        irrelevant = ("output", "video", "tolerance", "resume", "overwrite", "chunk", "devices")
+        irrelevant = "output video tolerance resume overwrite chunk devices disturbance".split()
         options = {k: v for k, v in dataclasses.asdict(self).items() if k not in irrelevant}
         options |= {"state_weights": np.diag(mpc.Q), "input_weights": np.diag(mpc.R)}
         if self.config is None:
@@ -297,7 +330,7 @@ class Simulate:
         """Return the command with the values of --config or `USUAL` for options not given."""
         found: dict[str, Any] = dict(USUAL)
         if self.config is not None:
-            file = load_robot_config(self.config)
+            file = configs.load_robot_config(self.config)
             robot = {name: getattr(file.robot, name) for name in ("horizon", "margin", "linearize")}
             found |= robot | {"rho": file.cost.rho}
         missing = {key: value for key, value in found.items() if getattr(self, key) is None}

@@ -21,6 +21,7 @@ file of their own, with the sections [robot] and [cost].
 
 from jaxmpc.app.config.loading import (
     from_results,
+    holds_system,
     load,
     load_robot_config,
     require_horizon,
@@ -47,6 +48,7 @@ __all__ = [
     "SweepPoints",
     "from_results",
     "grid_shape",
+    "holds_system",
     "load",
     "load_robot_config",
     "recursion_states",

@@ -129,6 +129,12 @@ def _spread(document: Mapping[str, Any]) -> dict[str, Any]:
     return found
 
 
+def holds_system(path: str | Path) -> bool:
+    """Return whether a file holds a linear problem, not the weights of a robot. Raises ValueError
+    as `load` does."""
+    return "system" in read_toml(path)
+
+
 def load_robot_config(path: str | Path) -> RobotConfig:
     """Read the TOML file of a robot's weights. Raises ValueError as `load` does."""
     document = read_toml(path)

@@ -1,0 +1,135 @@
+"""`jaxmpc simulate` of a problem file: closed loops of its linear plant, under disturbances."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxmpc.app import config as configs
+from jaxmpc.app.commands.compile_notice import Compiling
+from jaxmpc.app.commands.options import print_table
+from jaxmpc.checks import fail, require_memory
+from jaxmpc.closed_loop.disturbances import draw_disturbances, worst_disturbance
+from jaxmpc.closed_loop.simulation import Run, simulate
+from jaxmpc.files import as_json, open_folder, versions, write_arrays, write_json
+from jaxmpc.mpc.controller import Controller
+from jaxmpc.mpc.problem import MPC
+from jaxmpc.qp.admm import DEFAULT
+from jaxmpc.qp.status import Status
+from jaxmpc.sets.limits import row_violations, rows_kept
+
+FILES = ("summary.json", "runs.npz")
+
+
+@dataclasses.dataclass(frozen=True)
+class LinearLoops:
+    """Closed loops from `count` random states over `seconds`: starts are uniform in the middle part
+    `spread` of the state limits. disturbance: None, or a kind of `simulate_problem`."""
+
+    config: configs.Config
+    count: int
+    seconds: float
+    spread: float
+    seed: int
+    disturbance: str | None
+
+    @property
+    def steps(self) -> int:
+        """Number of time steps."""
+        return max(1, round(self.seconds / self.config.system.dt))
+
+    def starts(self) -> np.ndarray:
+        """Return the initial states (count, n)."""
+        lower, upper = self.config.state_range()
+        if not np.isfinite([lower, upper]).all():
+            cure = "Bound every state, so that starts can be drawn"
+            fail("limits.x_min, x_max", f"{lower} to {upper}", cure)
+        share = np.random.default_rng(self.seed).uniform(-1, 1, (self.count, len(lower)))
+        return (lower + upper) / 2 + self.spread * share * (upper - lower) / 2
+
+    def run(self, mpc: MPC) -> tuple[Run, np.ndarray]:
+        """Return the loops and what is added to their states (count, steps, n)."""
+        controller = Controller(mpc, self.config.build_solver() or DEFAULT)
+        references, x0s, shape = self.config.references(), self.starts(), (self.count, self.steps)
+
+        def loop(x0: Any, w: Any) -> Run:
+            return simulate(controller, mpc.system, x0, self.steps, disturbance=w, **references)
+
+        loops = jax.jit(jax.vmap(loop))
+        if self.disturbance is None:
+            w = np.zeros((*shape, mpc.system.n))
+        else:
+            kind = "inside" if self.disturbance == "inside" else "vertices"
+            w = draw_disturbances(mpc, self.steps, self.count, kind=kind, seed=self.seed)
+        run = loops(x0s, w)
+        planned = np.flatnonzero(np.asarray(run.status)[:, 0] == Status.SOLVED)
+        if self.disturbance == "worst" and len(planned):
+            w[planned], _ = worst_disturbance(controller, x0s[planned], self.steps, seed=self.seed)
+            run = loops(x0s, w)
+        return run.on_host(), w
+
+
+def simulate_problem(loops: LinearLoops, output: Path, overwrite: bool) -> None:
+    """Simulate the closed loops of a problem file, write the files, print the table.
+
+    Disturbances: "vertices" of [disturbance] at random, points "inside" at random, or the "worst"
+    that ascent by gradient finds for each start. Raises ValueError for what makes no sense.
+    """
+    config = loops.config
+    there = [output / name for name in FILES if (output / name).exists()]
+    if there and not overwrite:
+        fail(str(there[0]), "exists", "Add --overwrite to replace it")
+    mpc = config.build_controlled()
+    if mpc.disturbance is None and loops.disturbance is not None:
+        fail("--disturbance", f"{loops.disturbance}, and the file has none", "Add [disturbance]")
+    if mpc.input_in_state:
+        fail("limits.input_rate_limit", "given", "Loops of problem files start without an input")
+    each = 8 * (3 * mpc.system.n + mpc.system.m + 4) * loops.steps
+    require_memory("--count, --seconds", loops.count * each, "Simulate fewer loops, or less time")
+    open_folder(output)
+    text = loops.disturbance or "none"
+    print(f"{config.name}: {loops.count:,} loops of {loops.steps} steps -> {output}")
+    with jax.enable_x64(True), Compiling() as wait:
+        wait.begin(f"closed loops of {config.name}", programs=1)
+        run, w = loops.run(mpc)
+    states, inputs, status = (np.asarray(v) for v in (run.states, run.inputs, run.status))
+    planned = status[:, 0] == Status.SOLVED
+    limits = (config.state_limits(), states), (mpc.inputs, inputs)
+    kept = np.all([rows_kept(*pair).all(axis=(1, 2)) for pair in limits], axis=0) & planned
+    excess = row_violations(*limits[0])[planned]
+    worst = float(excess.max(initial=0.0))
+    solved = float((status[planned] == Status.SOLVED).mean()) if planned.any() else float("nan")
+    cost = float(np.asarray(run.stage_cost)[planned].sum(axis=1).mean()) if planned.any() else None
+    summary = {
+        "count": loops.count,
+        "steps": loops.steps,
+        "disturbance": text,
+        "policy": None if mpc.disturbance is None else mpc.policy,
+        "planned": int(planned.sum()),
+        "kept": int(kept.sum()),
+        "worst_violation": worst,
+        "plans_solved": solved,
+        "mean_cost": cost,
+        "config": config.to_dict("simulate"),
+        "versions": versions(),
+    }
+    arrays = {"states": states, "inputs": inputs, "status": status, "disturbances": w}
+    write_arrays(output / FILES[1], **arrays)
+    write_json(output / FILES[0], as_json(summary))
+    meaning = {
+        "vertices": "random vertices at each step: a sample, no proof",
+        "inside": "random points at each step: a sample, no proof",
+        "worst": "found by gradient for each start: a local search, no proof",
+    }
+    rows = [
+        ("disturbance", meaning.get(text, "none")),
+        ("with a plan", f"{planned.sum():,} of {loops.count:,} starts; the rest counts no further"),
+        ("limits kept", f"{kept.sum():,} of {planned.sum():,} loops"),
+        ("worst", f"{worst:.3g} beyond a state limit, in its unit"),
+        ("plans solved", f"{100 * solved:.2f} %"),
+        ("cost", "none" if cost is None else f"{cost:.6g}, mean of the loops with a plan"),
+        ("files", " ".join(str(output / name) for name in FILES)),
+    ]
+    print_table(rows, 13)
