@@ -25,6 +25,7 @@ from jaxmpc.mpc.stagewise.sqp import solve_nonlinear
 from jaxmpc.pytrees import prepared_pytree, static
 from jaxmpc.qp.admm import ADMM, DEFAULT
 from jaxmpc.qp.linalg import arrays, floating_dtype
+from jaxmpc.robots.contacts import friction_cones, stands
 from jaxmpc.robots.description import host_coordinates
 from jaxmpc.robots.equilibria import settled
 from jaxmpc.robots.force_limits import ForceLimits, force_limits, stopping_limits
@@ -95,7 +96,8 @@ def robot_mpc(
     if isinstance(terminal_cost, str):
         if terminal_cost != "lqr":
             fail("terminal_cost", f"{terminal_cost!r}", 'Give "lqr", a matrix or None')
-        terminal_cost = _terminal_cost(system, np.asarray(Q), R, names) if rests else None
+        named = () if stands(robot) else names  # feet that stand are not moved, as they shall
+        terminal_cost = _terminal_cost(system, np.asarray(Q), R, named) if rests else None
     usual = {"constrained_stages": tuple(range(1, horizon + 1)), "terminal_cost": terminal_cost}
     mpc = replace(mpc, **{**usual, **fields})
     if isinstance(robot, Robot):
@@ -108,8 +110,12 @@ def robot_mpc(
 def _limits_of_forces(
     robot: Robot, x: np.ndarray, u: np.ndarray, states: Box, horizon: int
 ) -> Iterator[Outputs]:
-    """Yield the limits of forces at all stages, and at the first and the last what they need to
-    stop: no input moves x_0, but a plan from where nothing stops the robot says so."""
+    """Yield the friction cones of feet that stand, the limits of forces at all stages, and at the
+    first and the last what they need to stop: no input moves x_0, but a plan from where nothing
+    stops the robot says so."""
+    cones = friction_cones(robot, x, u)
+    if cones is not None:
+        yield replace(cones, stages=tuple(range(horizon)))
     forces = force_limits(robot, x, u)
     if forces is None:
         return
@@ -164,12 +170,13 @@ def _terminal_cost(
     if least_reached(A, B)[0] > _UNREACHED:
         return np.asarray(lqr(system, Q, R).P)
     T = reached_subspace(A, B)
-    unmoved = np.flatnonzero(np.linalg.norm(T, axis=1) < 0.999)
-    warnings.warn(
-        f"terminal_cost: inputs do not move all of {_listed(unmoved, names)} (no equilibrium there "
-        "is stabilizable); it is the LQR's of what they move",
-        stacklevel=3,
-    )
+    if names:
+        unmoved = np.flatnonzero(np.linalg.norm(T, axis=1) < 0.999)
+        warnings.warn(
+            f"terminal_cost: inputs do not move all of {_listed(unmoved, names)} (no equilibrium "
+            "there is stabilizable); it is the LQR's of what they move",
+            stacklevel=3,
+        )
     reduced = LinearSystem(T.T @ A @ T, T.T @ B)
     return T @ np.asarray(lqr(reduced, T.T @ Q @ T, R).P) @ T.T
 

@@ -435,6 +435,7 @@ def simulate_many(
     references: Reals | None = None,
     input_references: Reals | None = None,
     disturbance: Reals | None = None,
+    disturbances: Reals | None = None,
     output_disturbance: Reals | None = None,
     forecast: Reals | None = None,
     previous_input: Reals | None = None,
@@ -454,6 +455,7 @@ def simulate_many(
         same for all loops.
     references, input_references: one for each loop, (B, n) and (B, m), or over time (B, T + N, n)
         and (B, T + N − 1, m); in place of those for all.
+    disturbances (B, T, n): one for each loop, in place of that for all.
     noise: as in `simulate`, each loop with its own (see `Noise.seed`).
     variations: parameters of the plant that differ between the B loops, as `plant.vary` takes
         them, each with B in front: dict(body_mass=(B, nbody), payload=(B,)) randomises masses
@@ -480,6 +482,7 @@ def simulate_many(
     given = Conditions(*aims, *added, previous_input, noise, observer, delay, bool(compensate))
     plant, _, shared = checked_loop(controller, plant, x0s[0], steps, given)
     several = {"reference": references, "input_reference": input_references}
+    several["disturbance"] = disturbances
     own = {name: np.asarray(value) for name, value in several.items() if value is not None}
     _require_own(own, given, controller, steps, len(x0s))
     numbers = None if noise is None else np.arange(len(x0s))
@@ -520,9 +523,11 @@ class Each:
 def _require_own(
     own: Mapping[str, np.ndarray], shared: Conditions, controller: Feedback, steps: int, count: int
 ) -> None:
-    """Raise ValueError unless the references of each loop have these shapes."""
+    """Raise ValueError unless what each loop has of its own, references and disturbances, has these
+    shapes."""
     widths = getattr(controller, "reference_sizes", None)
     shapes = reference_shapes(controller.mpc, steps, widths)
+    shapes["disturbance"] = [(steps, controller.state_size)]
     for name, value in own.items():
         if getattr(shared, name) is not None:
             fail(f"{name}s", f"given beside {name}", "Give one for all loops, or one for each")

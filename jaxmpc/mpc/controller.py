@@ -413,8 +413,8 @@ def stated_terms(controller: Controller, y: Array, x: Array, u: Array, aim: Aim)
         violations.append(bounds.violation(v))
         sizes.append(jnp.maximum(bounds.sizes(), jnp.abs(v)))
 
-    moved = [M.reshape(-1, M.shape[-1]) for M in (c.Gamma, c.Omega)]
-    g = matmul(jnp.concatenate([gx.ravel(), gu.ravel()]), jnp.concatenate(moved))
+    moved = jnp.concatenate([M.reshape(-1, M.shape[-1]) for M in (c.Gamma, c.Omega)])
+    g = matmul(jnp.concatenate([gx.ravel(), gu.ravel()]), moved)
     length, rounds = (jnp.sqrt(2 * jnp.maximum(v, 0.0)) for v in (J, cancels))
     rounds = rounds + jnp.max(jnp.abs(y) * factor.row_norms, initial=0.0)
 
@@ -426,13 +426,19 @@ def stated_terms(controller: Controller, y: Array, x: Array, u: Array, aim: Aim)
     most = jnp.broadcast_to(most, terms.shape)
     row_size = jnp.concatenate([*sizes, y[:0]])
     per_variable = 1 / jnp.sum(jnp.abs(factor.T), axis=1)
+    # At a set-point tracking errors are zero, but not their rounding, which adds up over the steps
+    # whose terms cancel, as where inputs balance the weight.
+    size = jax.tree.map(jnp.abs, weights)
+    steps = jnp.cumsum(jnp.concatenate([jnp.abs(x[:1]), terms]), axis=0)
+    parts = size.of_states(steps).ravel(), size.of_inputs(jnp.abs(u)).ravel()
+    apart = matmul(jnp.concatenate(parts), 2 * jnp.abs(moved))
     return [
         (
             jnp.concatenate([*violations, defects.ravel()]),
             jnp.concatenate([row_size + SHARE * length * factor.row_norms, most.ravel()]),
             jnp.concatenate([row_size + rounds * factor.row_norms, terms.ravel()]),
         ),
-        (g, length * per_variable, rounds * per_variable),
+        (g, length * per_variable, rounds * per_variable + apart),
         (gap[None], 2 * J[None], (cancels + products)[None]),
     ]
 

@@ -6,12 +6,16 @@ contacts and dry friction do not help. What was found is tried on the file.
 
 import copy
 
+import jax
 import numpy as np
 from scipy.optimize import least_squares, lsq_linear
 
 from jaxmpc.checks import fail
 from jaxmpc.pytrees import record
+from jaxmpc.qp.problem import QP
+from jaxmpc.qp.solve import solve_qp
 from jaxmpc.robots.configurations import blocks
+from jaxmpc.robots.contacts import Feet
 from jaxmpc.robots.couplings import Couplings, equality_jacobian, projector
 from jaxmpc.robots.description import RobotDescription
 from jaxmpc.robots.mujoco_access import flag, mujoco, name_of, single_joints
@@ -90,6 +94,7 @@ class Forces:
         lower[bounded] = np.maximum(lower[bounded], low)
         upper[bounded] = np.minimum(upper[bounded], high)
         self.lower, self.upper, self.m = lower, upper, robot.m
+        self.feet: Feet | None = getattr(robot.predictor, "feet", None)
 
     def parts(self, drive: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the inputs u (m,) and the activations (na,) of a drive."""
@@ -163,6 +168,8 @@ def rest_at(robot: RobotDescription, q: np.ndarray, *, within: bool = False) -> 
     """Return the robot at rest in q (nq,) under the drive that comes nearest to a balance: the
     least one of all inputs, or one within the limits."""
     forces = Forces(robot)
+    if forces.feet is not None:
+        return _standing(forces, forces.feet, q)
     q = forces.couplings.met(q)
     J, f = forces.affine(q)
     drive = np.linalg.lstsq(J, -f, rcond=None)[0]
@@ -171,6 +178,38 @@ def rest_at(robot: RobotDescription, q: np.ndarray, *, within: bool = False) -> 
         drive = lsq_linear(J, -f, (forces.lower - wide, forces.upper + wide)).x
         drive = np.clip(drive, forces.lower, forces.upper)
     return forces.rest(q, drive, f)
+
+
+# Weights of the inputs, of their half-widths, and of normal forces, beside that of tangential
+# forces, of the weight.
+_EFFORT, _NORMAL = 1e-2, 1e-4
+
+
+def _standing(forces: Forces, feet: Feet, q: np.ndarray) -> Rest:
+    """Return the robot at rest on its feet in q (nq,): of the contact forces inside the friction
+    cones and inputs within the limits that balance the weight, those of the least tangential
+    forces, and of these the least inputs. A quadratic program."""
+    J, f = forces.affine(q)
+    G = feet.jacobian(forces.model, forces.data)
+    size, faces = 1 + float(np.abs(f).max()), feet.cones()
+    width = np.minimum((forces.upper - forces.lower) / 2, size)
+    on_feet = np.tile([_NORMAL, 1.0, 1.0], len(feet)) / (size / len(feet)) ** 2
+    balance = np.hstack([J, G.T])
+    inputs = np.eye(forces.m, forces.m + len(on_feet))
+    contacts = np.hstack([np.zeros((len(faces), forces.m)), faces])
+    below = np.full(len(faces), -np.inf)
+    with jax.enable_x64(True):
+        qp = QP(
+            P=np.diag(np.append(_EFFORT / width**2, on_feet)),
+            q=np.zeros(forces.m + len(on_feet)),
+            A=np.vstack([balance, inputs, contacts]),
+            l=np.concatenate([-f, forces.lower, below]),
+            u=np.concatenate([-f, forces.upper, np.zeros(len(faces))]),
+        )
+        drive, contact = np.split(np.asarray(solve_qp(qp).z), [forces.m])
+    drive = np.clip(drive, forces.lower, forces.upper)
+    missing = forces.at(q, drive) + G.T @ contact
+    return Rest(q, *forces.parts(drive), drive, forces.lower, forces.upper, missing, size)
 
 
 # What takes a rest away: the constraints, see `mujoco_access.flag`, or "" for limits of forces; in
@@ -195,6 +234,8 @@ def require_rest(
     touching: where contacts or stops do, return the sentence instead.
     """
     plant, smooth = robot.mujoco, robot.predictor.model
+    if hasattr(robot.predictor, "feet"):
+        return []  # MuJoCo's contacts are springs, into which a robot sinks first
     file = copy.deepcopy(robot.file or plant)
     # Inputs are not clamped, and of a motor's force limits the box of inputs is in charge.
     file.opt.disableflags |= flag("clampctrl")
@@ -262,6 +303,9 @@ def settled(robot: RobotDescription) -> tuple[Rest, list[str]]:
     rest, moved = rest_at(robot, q), list[str]()
     if rest.held:
         moved = require_rest("home", robot, [rest], touching=True)
+    elif hasattr(robot.predictor, "feet"):
+        cure = "Give another home=, more torque, or feet with more friction"
+        fail("robot", f"{robot.name} cannot stand at home: {lacking(robot, rest)}", cure)
     elif (near := nearest_rest(robot, q)).held:
         rest, far = near, np.abs(near.q - q).max()
         moved = require_rest("home", robot, [rest], touching=True)

@@ -95,9 +95,13 @@ class Physics:
             forward = lambda q, v: self._accelerations(False, numbers, q, v, act, u)
             return self._runge_kutta(forward, q, v, h)
         moved = _next_activations(*self._forced(numbers, q, v, act, u)) if self.model.na else act
-        v = v + h * self._accelerations(True, numbers, q, v, act, u)
+        v = v + h * self._rates(numbers, q, v, act, u)
         # MJX's own integration of positions has the derivative 0 for a body that does not turn.
         return jnp.concatenate([retract(self.joints, q, h * v), v, moved])
+
+    def _rates(self, numbers: dict[str, Array], q: Array, v: Array, act: Array, u: Array) -> Array:
+        """Return the accelerations (nv,) that a physics step goes on with."""
+        return self._accelerations(True, numbers, q, v, act, u)
 
     def data(self, x: Array, u: Array, numbers: Mapping[str, Any] | None = None) -> Any:
         """Return mjx.Data at x = (qpos, qvel, act) under u: poses and velocities of bodies, geoms

@@ -9,7 +9,7 @@ controller has to keep u inside `input_limits`.
 """
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import field, replace
 from typing import Any
 
@@ -25,6 +25,7 @@ from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.jax_transformations import own_modes, varying
 from jaxmpc.qp.linalg import eigh, matmul
 from jaxmpc.robots.configurations import difference, quaternions, retract
+from jaxmpc.robots.contacts import standing_physics
 from jaxmpc.robots.couplings import Couplings
 from jaxmpc.robots.description import RobotDescription
 from jaxmpc.robots.equilibria import (
@@ -255,6 +256,19 @@ class Robot(RobotDescription):
         with jax.enable_x64(True):
             q = np.array([self.state(np.append(p, 0 * p))[: self.mujoco.nq] for p in given])
         return np.hstack([given, velocity]), self.inverse_dynamics(q, velocity, acceleration)
+
+    def standing(self, feet: Sequence[str], *, friction: float | None = None) -> "Robot":
+        """Return the same robot with a model whose feet stand where they touch the ground at home.
+
+        feet: names of geoms, spheres, that touch something fixed. friction: coefficient μ that
+        plans count on, None for 80 % of the file's. The plant is the same, with its own contacts.
+        Linear models, `equilibrium` and `set_point` hold the feet still by contact forces, and
+        `robot_mpc` has the friction cones as rows: see `jaxmpc/robots/contacts.py`.
+
+        Raises ValueError for geoms that are no spheres or do not touch within 5 mm, for models
+        with equalities or the integrator RK4, and where the feet hold one another.
+        """
+        return replace(self, predictor=standing_physics(self, feet, friction))
 
     def vary(self, **numbers: Any) -> "Robot":
         """Return the same robot with other numbers in its plant; models and controllers keep

@@ -1,0 +1,279 @@
+"""Feet that stand: contact forces in the model of a plan, and their friction cones as its rows.
+
+A foot that stands does not move. With the velocities J v of the points of contact, along the normal
+and two tangents of each, and the contact forces λ there, the model is
+
+    M a = τ(q, v, u) + J'λ,        J a + J̇ v = −β J v,
+
+the rigid contact of inelastic feet: what velocity a foot has dies away at the rate β (1/s), that of
+the file's own contacts (solref), and none arises. M and τ hold all else: inertia, gravity,
+springs, actuators, the integrator's implicit part. The second line gives the forces,
+
+    λ = −(J M⁻¹ J')⁻¹ (J M⁻¹ τ + J̇ v + β J v),
+
+a function of state and input like the force of a servo, so that the inputs of the plan stay those
+of the plant. Its other half is that a foot can push but not pull, and slides where it is pushed
+sideways too hard: |λ_1| + |λ_2| ≤ μ λ_n, the pyramid that MuJoCo's own cones hold or contain. These
+are rows in ξ and u of `robot_mpc` (`friction_cones`), not of the model, in which feet never slip.
+
+The plant keeps its real contacts: springs that sink in, slide, and let go.
+"""
+
+import copy
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxmpc.checks import fail, number
+from jaxmpc.pytrees import record
+from jaxmpc.qp.linalg import matmul, solve
+from jaxmpc.robots.configurations import normalised, retract
+from jaxmpc.robots.description import RobotDescription
+from jaxmpc.robots.force_limits import ForceLimits
+from jaxmpc.robots.mujoco_access import equalities, mujoco, names, number_of
+from jaxmpc.robots.physics import RK4, Physics
+
+# Distances (m) of feet from the ground up to which they are looked for, and up to which they touch.
+_NEAR, _TOUCHING = 0.05, 0.005
+# Part of the file's friction that plans count on: what the model leaves out needs the rest.
+_FRICTION = 0.8
+# Smallest motion of a foot, relative to the largest, that counts as one.
+_RANK = 1e-6
+
+
+@record
+class Feet:
+    """Points of contact of feet that stand: spheres on the ground that they touch at home.
+
+    names, geoms (k,): the feet, numbers of their geoms. radius (k,). frames (k, 3, 3): rows normal
+    (towards the foot) and two tangents. friction (k,): coefficients of the plan. rate (k,): 1/s, by
+    which a foot comes to rest.
+    """
+
+    names: tuple[str, ...]
+    geoms: np.ndarray
+    bodies: np.ndarray
+    radius: np.ndarray
+    frames: np.ndarray
+    friction: np.ndarray
+    rate: np.ndarray
+
+    @classmethod
+    def touching(
+        cls,
+        model: "mujoco.MjModel",
+        q: np.ndarray,
+        feet: tuple[str, ...],
+        friction: float | None,
+    ) -> "Feet":
+        """Return the feet of a model that touch the ground at q (nq,).
+
+        feet: names of geoms. friction: coefficient for plans, None for 80 % of the file's. Raises
+        ValueError for geoms that are no spheres or do not touch.
+        """
+        geoms = np.array([_foot(model, name) for name in feet])
+        near, data = _with_margins(model, geoms), mujoco.MjData(model)
+        data.qpos[:] = q
+        mujoco.mj_forward(near, data)
+        frames, coefficients, rates = [], [], []
+        for name, geom in zip(feet, geoms, strict=True):
+            contact, sign = _ground_contact(model, data, geom)
+            if contact is None or contact.dist > _TOUCHING:
+                away = "far" if contact is None else f"{contact.dist:.3g} m"
+                problem = f"geom {name} is {away} from the ground at home"
+                fail("feet", problem, "Give a home= in which the feet touch the ground")
+            frames.append(np.reshape(contact.frame, (3, 3)) * [[sign], [1], [1]])
+            coefficients.append(_FRICTION * contact.friction[0] if friction is None else friction)
+            rates.append(_rate(model, contact))
+        return cls(
+            names=tuple(feet),
+            geoms=geoms,
+            bodies=model.geom_bodyid[geoms],
+            radius=model.geom_size[geoms, 0],
+            frames=np.array(frames),
+            friction=np.array(coefficients),
+            rate=np.array(rates),
+        )
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def jacobian(self, model: "mujoco.MjModel", data: "mujoco.MjData") -> np.ndarray:
+        """Return J (3k, nv) of the velocities of the points of contact, by MuJoCo's C engine at the
+        position in `data`."""
+        rows, J = [], np.zeros((3, model.nv))
+        for geom, body, r, frame in zip(
+            self.geoms, self.bodies, self.radius, self.frames, strict=True
+        ):
+            point = data.geom_xpos[geom] - r * frame[0]
+            mujoco.mj_jac(model, data, J, None, point, body)
+            rows.append(frame @ J)
+        return np.concatenate(rows)
+
+    def cones(self) -> np.ndarray:
+        """Return the faces (4k, 3k) of the friction cones, F λ ≤ 0: ±λ_1 ± λ_2 ≤ μ λ_n."""
+        signs = [(1, 1), (1, -1), (-1, 1), (-1, -1)]
+        faces = np.zeros((len(self), 4, len(self), 3))
+        for i, mu in enumerate(self.friction):
+            faces[i, :, i] = [(-mu, *pair) for pair in signs]
+        return faces.reshape(4 * len(self), 3 * len(self))
+
+
+def _foot(model: "mujoco.MjModel", name: str) -> int:
+    """Return the number of a foot's geom; raise ValueError for others."""
+    geom = number_of(model, "geom", name)
+    if geom < 0:
+        known = ", ".join(filter(None, names(model, "geom"))) or "none has a name"
+        fail("feet", f"no geom is named {name!r}", f"Name one of the geoms: {known}")
+    if model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_SPHERE:
+        fail("feet", f"geom {name} is no sphere", "Feet are points: put spheres where they touch")
+    if not model.body_weldid[model.geom_bodyid[geom]]:
+        fail("feet", f"geom {name} is part of the world", "Name geoms of the robot")
+    return geom
+
+
+def _with_margins(model: "mujoco.MjModel", geoms: np.ndarray) -> "mujoco.MjModel":
+    """Return the model, whose contacts are found also where these geoms are near."""
+    near = copy.deepcopy(model)
+    near.geom_margin[geoms] = _NEAR
+    return near
+
+
+def _ground_contact(model: "mujoco.MjModel", data: "mujoco.MjData", geom: int) -> tuple[Any, float]:
+    """Return the deepest contact of a geom with the world, None for none, and the sign of its
+    normal towards the geom."""
+    found: tuple[Any, float] = None, 1.0
+    for contact in data.contact:
+        first, second = contact.geom
+        other = second if first == geom else first
+        if geom in (first, second) and not model.body_weldid[model.geom_bodyid[other]]:
+            if found[0] is None or contact.dist < found[0].dist:
+                found = contact, 1.0 if second == geom else -1.0
+    return found
+
+
+def _rate(model: "mujoco.MjModel", contact: Any) -> float:
+    """Return the rate (1/s) at which a contact's reference acceleration brings a velocity to rest,
+    once a physics step at most."""
+    most, (first, second) = 1 / model.opt.timestep, contact.solref
+    if first <= 0:
+        return min(-second / contact.solimp[1], most)
+    return min(2 / (contact.solimp[1] * first), most)
+
+
+class StandingPhysics(Physics):
+    """A model without contacts whose feet stand; see the top of this file."""
+
+    def __init__(self, model: "mujoco.MjModel", feet: Feet) -> None:
+        super().__init__(model)
+        self.feet = feet
+
+    def _rates(self, numbers: dict[str, Array], q: Array, v: Array, act: Array, u: Array) -> Array:
+        return self._standing(numbers, q, v, act, u)[0]
+
+    def contact_forces(self, x: Array, u: Array) -> Array:
+        """Return the contact forces λ (3k,), normal and two tangential ones of each foot (N), at
+        x = (qpos, qvel, act) under u."""
+        q, v, act = jnp.split(x, [self.model.nq, self.model.nq + self.model.nv])
+        return self._standing({}, normalised(self.joints, q), v, act, u)[1]
+
+    def _standing(
+        self, numbers: dict[str, Array], q: Array, v: Array, act: Array, u: Array
+    ) -> tuple[Array, Array]:
+        """Return the accelerations (nv,) and the contact forces (3k,)."""
+        model, data = self._forced(numbers, q, v, act, u)
+        M = self._dynamics(numbers, q, v)[0] + self._added(model, data, True)
+        free = self._accelerations(True, numbers, q, v, act, u)
+        velocities = lambda t: matmul(
+            self._feet_jacobian(numbers, retract(self.joints, q, t * v)), v
+        )
+        zero, one = jnp.zeros((), q.dtype), jnp.ones((), q.dtype)
+        speeds, drift = jax.jvp(velocities, (zero,), (one,))
+        J = self._feet_jacobian(numbers, q)
+        by_forces = solve(M, J.T)
+        rate = np.repeat(self.feet.rate, 3).astype(q.dtype)
+        lacking = matmul(J, free) + drift + rate * speeds
+        forces = -solve(matmul(J, by_forces), lacking)
+        return free + matmul(by_forces, forces), forces
+
+    def _feet_jacobian(self, numbers: dict[str, Array], q: Array) -> Array:
+        """Return J (3k, nv) of the velocities of the points of contact."""
+        feet, nv = self.feet, self.model.nv
+        poses = self._dynamics(numbers, q, jnp.zeros(nv, q.dtype))[2]
+        frames = feet.frames.astype(q.dtype)
+        points = (
+            poses["geom_xpos"][feet.geoms] - feet.radius[:, None].astype(q.dtype) * frames[:, 0]
+        )
+        arms = points - poses["subtree_com"][self.tree.root[feet.bodies]]
+        turns, shifts = poses["cdof"][:, :3], poses["cdof"][:, 3:]
+        motions = shifts[None] + jnp.cross(turns[None], arms[:, None])
+        motions = motions * self.tree.moves[feet.bodies][:, :, None].astype(q.dtype)
+        return jnp.einsum("kij,kvj->kiv", frames, motions, precision="highest").reshape(-1, nv)
+
+
+def stands(robot: Any) -> bool:
+    """Return whether the model of a robot has feet that stand."""
+    return isinstance(getattr(robot, "predictor", None), StandingPhysics)
+
+
+def standing_physics(
+    robot: RobotDescription, feet: Sequence[str], friction: float | None
+) -> StandingPhysics:
+    """Return the model of a robot with these feet standing; see `Robot.standing`."""
+    model, q = robot.predictor.model, robot.home[: robot.mujoco.nq]
+    if isinstance(feet, str) or not feet:
+        fail("feet", f"{feet!r}", "Give the names of geoms, one for each foot")
+    if len(set(feet)) != len(feet):
+        fail("feet", f"{tuple(feet)} has a name twice", "Name each foot once")
+    if friction is not None:
+        number("friction", friction, 0.0, "Give a coefficient of at least 0")
+    if model.opt.integrator == RK4:
+        cure = "Use Euler or implicitfast"
+        fail("robot", f"{robot.name} has the integrator RK4, which holds no feet", cure)
+    if equalities(model):
+        problem = f"{robot.name} has equalities (couplings of joints or bodies) in its file"
+        fail("robot", problem, "Models with feet that stand take none yet")
+    found = Feet.touching(robot.mujoco, np.asarray(q, float), tuple(feet), friction)
+    data = mujoco.MjData(model)
+    data.qpos[:] = q
+    mujoco.mj_forward(model, data)
+    sizes = np.linalg.svd(found.jacobian(model, data), compute_uv=False)
+    if len(sizes) < 3 * len(found) or sizes[-1] < _RANK * sizes[0]:
+        problem = f"{', '.join(found.names)} hold one another: contact forces are not unique"
+        fail("feet", problem, "Name one sphere for each leg that moves by itself")
+    return StandingPhysics(model, found)
+
+
+def friction_cones(robot: RobotDescription, x: Any, u: Any) -> ForceLimits | None:
+    """Return the friction cones of the feet that stand as rows in ξ and u, None without such feet.
+
+    x (nq + nv + na,), u (m,): where the contact forces are linearised, in float64.
+    """
+    physics = robot.predictor
+    if not isinstance(physics, StandingPhysics):
+        return None
+    feet = physics.feet
+    with jax.enable_x64(True):
+        xi, u = robot.coordinates(jnp.asarray(x, float)), jnp.asarray(u, float)
+
+        def forces(xi: Array, u: Array) -> tuple[Array, Array]:
+            found = physics.contact_forces(robot.state(xi), u)
+            return found, found
+
+        slopes, there = jax.jit(jax.jacfwd(forces, argnums=(0, 1), has_aux=True))(xi, u)
+        by_state, by_input = (np.asarray(slope) for slope in slopes)
+    faces = feet.cones()
+    shift = np.asarray(there) - by_state @ np.asarray(xi) - by_input @ np.asarray(u)
+    labels = tuple(f"friction cone of {name}" for name in feet.names for _ in range(4))
+    return ForceLimits(
+        faces @ by_state,
+        upper=-faces @ shift,
+        D=faces @ by_input,
+        stages=None,
+        names=labels,
+        units=("N",) * len(labels),
+    )
