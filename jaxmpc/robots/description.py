@@ -196,6 +196,9 @@ def _read(robot: RobotDescription, more: tuple[str, ...]) -> tuple[str, ...]:
         f"solver {word(solver)}, {options.iterations} iterations",
         *more,
     ]
+    feet = getattr(robot.predictor, "feet", None)
+    if feet is not None:
+        lines.append(f"feet that stand in linear models: {', '.join(feet.names)}")
     if model.na:
         lines.append(f"{model.na} activation states, behind the velocities in the state")
     if model.nmocap:

@@ -1,0 +1,189 @@
+"""Feet that stand: the model of the plan against balances written down with MuJoCo's C engine,
+statics against a linear program, and what is refused."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+from scipy.optimize import linprog
+
+import jaxmpc as jm
+from jaxmpc.robots.contacts import friction_cones
+from jaxmpc.robots.description import host_coordinates
+
+QUADRUPED = Path(__file__).parents[2] / "experiments" / "robots" / "quadruped.xml"
+FEET = ("FL", "FR", "RL", "RR")
+
+# A trunk on one leg, whose foot is below its centre of mass.
+HOPPER = """<mujoco><option timestep=".002" integrator="{integrator}"/><default>
+<geom contype="0" conaffinity="0"/><joint armature=".01" damping=".2"/></default><worldbody>
+<geom name="floor" type="plane" size="1 1 .1" conaffinity="1" friction=".7 .1 .1"/>
+<body pos="0 0 {height}"><freejoint name="base"/>
+<geom name="trunk" type="box" size=".1 .08 .05" mass="5"/>
+<body name="hip"><joint name="abduction" axis="1 0 0"/><geom type="sphere" size=".03" mass=".3"/>
+<body><joint name="hip" axis="0 1 0"/>
+<geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02" mass=".5"/>
+<body pos="0 0 -.3"><joint name="knee" axis="0 1 0"/>
+<geom type="capsule" fromto="0 0 0 0 0 -.3" size=".015" mass=".2"/>
+<geom name="foot" type="sphere" size=".03" pos="0 0 -.3" mass=".05" contype="1"/>
+</body></body></body></body></worldbody><actuator><motor joint="abduction" ctrlrange="-30 30"/>
+<motor joint="hip" ctrlrange="-30 30"/><motor joint="knee" ctrlrange="-{knee} {knee}"/></actuator>
+<keyframe><key qpos="{x} 0 {height} 1 0 0 0 0 {bend} {back}"/></keyframe></mujoco>"""
+BEND = 0.6
+
+
+def hopper(integrator="implicitfast", height=None, knee=30):
+    """The hopper at home, its knee bent and its foot below the centre of mass."""
+    height = 0.6 * np.cos(BEND) + 0.0299 if height is None else height
+    text = HOPPER.format(
+        integrator=integrator, height=height, knee=knee, x=0.0, bend=BEND, back=-2 * BEND
+    )
+    return jm.load_robot(mujoco.MjModel.from_xml_string(text))
+
+
+@pytest.fixture(scope="module")
+def standing():
+    """The hopper on its foot."""
+    return hopper().standing(["foot"], friction=0.5)
+
+
+def balance(robot, x, u):
+    """Accelerations and contact forces of feet at rest by M a = τ + J'λ, J a + J̇ v = −β J v.
+
+    All of it from MuJoCo's C engine; J̇ by differences, damping implicit as in its integrator.
+    """
+    model, feet = robot.predictor.model, robot.predictor.feet
+    data, h = mujoco.MjData(model), model.opt.timestep
+    q, v = x[: model.nq], x[model.nq :]
+
+    def jacobian(q):
+        data.qpos[:] = q
+        mujoco.mj_forward(model, data)
+        rows = np.zeros((3, model.nv))
+        point = data.geom("foot").xpos - [0, 0, 0.03]
+        mujoco.mj_jac(model, data, rows, None, point, model.geom("foot").bodyid[0])
+        return feet.frames[0] @ rows
+
+    moved = []
+    for sign in (1, -1):
+        place = q.copy()
+        mujoco.mj_integratePos(model, place, v, sign * 1e-5)
+        moved.append(jacobian(place))
+    drift = (moved[0] - moved[1]) @ v / 2e-5
+    J = jacobian(q)
+    data.qvel[:], data.ctrl[:] = v, u
+    mujoco.mj_forward(model, data)
+    M = np.zeros((model.nv, model.nv))
+    for i, unit in enumerate(np.eye(model.nv)):
+        mujoco.mj_mulM(model, data, M[i], unit)
+    M += h * np.diag(model.dof_damping)
+    force = data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator
+    rate = 2 / (0.95 * 0.02)  # of MuJoCo's default contact: solref 0.02, solimp up to 0.95
+    K = np.block([[M, -J.T], [J, np.zeros((3, 3))]])
+    return np.split(np.linalg.solve(K, np.append(force, -drift - rate * (J @ v))), [model.nv])
+
+
+def period(robot, x, u):
+    """The state one control period later, by `balance` and semi-implicit Euler."""
+    model = robot.predictor.model
+    q, v = np.split(x.copy(), [model.nq])
+    for _ in range(robot.substeps):
+        v = v + model.opt.timestep * balance(robot, np.append(q, v), u)[0]
+        mujoco.mj_integratePos(model, q, v, model.opt.timestep)
+    return np.append(q, v)
+
+
+def test_rest_on_a_foot(standing):
+    """The foot carries the weight, and the linear model rests there."""
+    x, u = standing.equilibrium()
+    weight = 9.81 * standing.mujoco.body_mass.sum()
+    a, forces = balance(standing, x, u)
+    np.testing.assert_allclose(forces, [weight, 0, 0], atol=1e-8)
+    np.testing.assert_allclose(a, 0, atol=1e-8)
+    with jax.enable_x64(True):
+        found = jax.jit(standing.predictor.contact_forces)(x, u)
+        after = standing.linearize(x, u, exact=True).step(host_coordinates(standing, x), u)
+    np.testing.assert_allclose(found, forces, atol=1e-9)
+    np.testing.assert_allclose(after, host_coordinates(standing, x), atol=1e-12)
+
+
+def test_linear_model_against_the_c_engine(standing):
+    """A and B of a period are the slopes of the balance of forces, cones of its forces."""
+    x, u = standing.equilibrium()
+    xi, step = host_coordinates(standing, x), 1e-5
+    with jax.enable_x64(True):
+        model = standing.linearize(x, u, exact=True)
+        state = jax.jit(standing.state)
+        moved = lambda d: np.asarray(state(xi + d[: len(xi)]))
+        slopes, of_forces = [], []
+        for d in step * np.eye(standing.n + standing.m):
+            ends = [(moved(s * d), u + s * d[len(xi) :]) for s in (1, -1)]
+            after, before = (host_coordinates(standing, period(standing, *end)) for end in ends)
+            slopes.append((after - before) / (2 * step))
+            pushed, pulled = (balance(standing, *end)[1] for end in ends)
+            of_forces.append((pushed - pulled) / (2 * step))
+    wanted = np.array(slopes).T
+    np.testing.assert_allclose(model.A, wanted[:, : len(xi)], atol=1e-6)
+    np.testing.assert_allclose(model.B, wanted[:, len(xi) :], atol=1e-6)
+    cones, by = friction_cones(standing, x, u), np.array(of_forces).T
+    faces = np.array([[-0.5, a, b] for a in (1, -1) for b in (1, -1)])
+    np.testing.assert_allclose(cones.C, faces @ by[:, : len(xi)], atol=1e-3)
+    np.testing.assert_allclose(cones.D, faces @ by[:, len(xi) :], atol=1e-5)
+    slack = cones.upper - cones.C @ xi - cones.D @ u
+    np.testing.assert_allclose(slack, 0.5 * 9.81 * standing.mujoco.body_mass.sum(), rtol=1e-9)
+
+
+def test_statics_of_four_feet():
+    """Torques and forces of rest are those of a linear program; without torque nothing rests."""
+    robot = jm.load_robot(QUADRUPED).standing(FEET)
+    feet, model = robot.predictor.feet, robot.predictor.model
+    np.testing.assert_allclose(feet.friction, 0.8)  # 80 % of the file's 1
+    np.testing.assert_allclose(feet.frames[:, 0], [[0, 0, 1]] * 4, atol=1e-12)
+    x, u = robot.equilibrium()
+    data = mujoco.MjData(model)
+    data.qpos[:] = x[: model.nq]
+    mujoco.mj_forward(model, data)
+    J = feet.jacobian(model, data)
+    actuation = np.zeros((model.nv, model.nu))
+    actuation[6:] = np.eye(model.nu)
+    left = data.qfrc_bias - actuation @ u  # what contacts have to give
+    normal, sideways = J[::3].T, np.concatenate([J[1::3], J[2::3]]).T
+    parts = np.hstack([normal, sideways, -sideways])
+    cost = np.repeat([0.0, 1.0], [4, 16])
+    found = linprog(cost, A_eq=parts, b_eq=left, bounds=(0, None))
+    assert found.status == 0 and found.x[4:].sum() < 0.1  # N: hardly any friction is needed
+    np.testing.assert_allclose(found.x[:4].sum(), 9.81 * model.body_mass.sum(), rtol=1e-9)
+    weak = replace(robot, input_limits=jm.Box(np.full(12, -1.0), np.ones(12)))
+    within = np.hstack([parts, actuation])
+    bounds = [(0, None)] * parts.shape[1] + [(-1, 1)] * model.nu
+    refused = linprog(np.zeros(within.shape[1]), A_eq=within, b_eq=data.qfrc_bias, bounds=bounds)
+    assert refused.status == 2
+    with pytest.raises(ValueError, match="no input balances the forces"):
+        weak.equilibrium()
+    with pytest.raises(ValueError, match="cannot stand at home"):
+        weak.set_point()
+
+
+def test_what_cannot_stand_is_named():
+    """Geoms that are no feet, feet in the air, models that are not stepped."""
+    robot = hopper()
+    for feet, message in (
+        (["toe"], "feet: no geom is named 'toe'. Name one of the geoms: floor, trunk, foot"),
+        (["trunk"], "feet: geom trunk is no sphere"),
+        (["foot", "foot"], "has a name twice"),
+        ("foot", "Give the names of geoms"),
+        ([], "Give the names of geoms"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            robot.standing(feet)
+    with pytest.raises(ValueError, match="friction: -1"):
+        robot.standing(["foot"], friction=-1)
+    with pytest.raises(ValueError, match="foot is 0.0[0-9]+ m from the ground at home"):
+        hopper(height=0.55).standing(["foot"])
+    with pytest.raises(ValueError, match="foot is far from the ground"):
+        hopper(height=1.0).standing(["foot"])
+    with pytest.raises(ValueError, match="RK4"):
+        hopper("RK4").standing(["foot"])
