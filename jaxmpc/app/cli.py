@@ -38,10 +38,11 @@ COMMANDS = {
 }
 DESCRIPTION = """Constrained MPC in batches, with proofs. Also: jaxmpc --version
 
-Every command takes --quiet (errors alone), --json (one JSON object in place of tables) and
---format {pdf,svg,png} (pictures in this format beside PNG). docs/how-to/commands.md tells more."""
-# Formats of pictures, and the files in which commands keep their results as JSON.
-FORMATS = ("pdf", "svg", "png")
+Every command takes --quiet (errors alone), --json (one JSON object in place of tables),
+--format {pdf,svg,png} (pictures in this format beside PNG) and --width {page,column} (of maps, for
+papers). docs/how-to/commands.md tells more."""
+# How pictures can be, and the files in which commands keep their results as JSON.
+CHOICES = {"--format": ("pdf", "svg", "png"), "--width": ("page", "column")}
 RECORDS = ("summary.json", "tuning.json", "solver.json")
 # What the line of an error begins with.
 ERROR = "jaxmpc: error: "
@@ -69,10 +70,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         return without_reader()
     except (ValueError, OSError, AssertionError) as error:  # tyro asserts that it knows a shell
         return report_error(str(error))
-    if everywhere.format is not None:
+    if everywhere.format is not None or everywhere.width == "column":
         import matplotlib
 
-        matplotlib.rcParams["savefig.format"] = everywhere.format
+        matplotlib.rcParams["savefig.format"] = everywhere.format or "png"
+        if everywhere.width == "column":  # which `jaxmpc.app.plots` reads
+            matplotlib.rcParams["figure.figsize"] = (3.5, 3.6)
+            matplotlib.rcParams["font.size"] = 8
     if not (everywhere.quiet or everywhere.json):
         with plain_output():
             return run(command, argv)
@@ -89,17 +93,18 @@ class Everywhere:
     """Options that every command takes.
 
     quiet: print errors alone. json: print one JSON object in place of tables. format: of pictures,
-    beside PNG; None for PNG alone.
+    beside PNG; None for PNG alone. width: of pictures, "page" or "column".
     """
 
     quiet: bool = False
     json: bool = False
     format: str | None = None
+    width: str = "page"
 
 
 def options_of_all(argv: Sequence[str]) -> tuple[Everywhere, list[str]]:
     """Return the options that every command takes, and the other words. Raises ValueError for a
-    format that there is not."""
+    format or a width that there is not."""
     found: dict[str, Any] = {}
     rest, words = list[str](), list(argv)
     while words:
@@ -107,11 +112,11 @@ def options_of_all(argv: Sequence[str]) -> tuple[Everywhere, list[str]]:
         name, equals, value = word.partition("=")
         if word in ("--quiet", "--json"):
             found[word[2:]] = True
-        elif name == "--format":
+        elif name in CHOICES:
             value = value if equals else words.pop(0) if words else "no value"
-            if value not in FORMATS:
-                fail("--format", value, f"Give one of {', '.join(FORMATS)}")
-            found["format"] = None if value == "png" else value
+            if value not in CHOICES[name]:
+                fail(name, value, f"Give one of {', '.join(CHOICES[name])}")
+            found[name[2:]] = value
         else:
             rest.append(word)
     return Everywhere(**found), rest

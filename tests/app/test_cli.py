@@ -137,7 +137,9 @@ def test_file_slice_and_overwrite(tmp_path, capsys):
     command = "sweep --config case.toml --axes 0 --grid 5 --fixed 0 0.5 --output out --overwrite"
     assert run(command) == 0
     out = capsys.readouterr().out
-    assert "length from" in out and "none: map.png shows two axes, and this map has 1" in out
+    assert (
+        "length from" in out and "none: map.png shows two or three axes, and this map has 1" in out
+    )
 
 
 @pytest.fixture

@@ -3,10 +3,15 @@
 import json
 
 import matplotlib
+import matplotlib.pyplot as plt
+import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+import jaxmpc as jm
 from jaxmpc.app import cli
+from jaxmpc.app.plots import plot_body
+from jaxmpc.app.plots.maps import finish, new_axes
 from jaxmpc.app.plots.style import save
 
 
@@ -69,6 +74,41 @@ def test_pictures_in_another_format(tmp_path, monkeypatch, capsys):
         if name == "pdf":
             assert path.with_suffix(".pdf").read_bytes().startswith(b"%PDF")
         matplotlib.rcParams["savefig.format"] = "png"
+
+
+def test_pictures_for_a_column(tmp_path, monkeypatch):
+    """As wide as asked, with all of the legend."""
+    for key in ("figure.figsize", "font.size", "savefig.format"):
+        monkeypatch.setitem(matplotlib.rcParams, key, matplotlib.rcParams[key])
+    path = tmp_path / "map.png"
+
+    def run(self):
+        ax = new_axes()
+        ax.plot([0, 1], [0, 1], label="line")
+        finish(ax, ["a [m]", "b [m]"], "A title", ax.lines[:])
+        save(ax.figure, path)
+
+    monkeypatch.setattr(cli._class("init", "Init"), "run", run)
+    assert cli.main(["init", "--width", "column"]) == 0
+    width = plt.imread(path).shape[1] / 150
+    assert 3.0 < width < 3.9
+    assert cli.main(["init", "--width", "poster"]) == 2
+
+
+def test_three_states_are_a_body_and_its_projections():
+    """Of a chain of three integrators; each panel shows the extent of the set."""
+    chain = jm.LinearSystem([[1, 1, 0], [0, 1, 1], [0, 0, 1.0]], [0, 0, 1.0])
+    box = jm.Box([-3, -2, -1], [3, 2, 1])
+    mpc = jm.MPC(chain, np.ones(3), 1.0, horizon=1, states=box, inputs=jm.Box(-1, 1))
+    fmap = jm.map_feasible_set(mpc, jm.grid([-3, -2, -1], [3, 2, 1], (3, 3, 3))).refine()
+    figure = plot_body(fmap)
+    assert len(figure.axes) == 4 and figure.axes[0].name == "3d"
+    for ax, (i, j) in zip(figure.axes[1:], ((0, 1), (0, 2), (1, 2)), strict=True):
+        line = ax.lines[0].get_xydata()
+        np.testing.assert_allclose(line.max(axis=0), np.array([3, 2, 1])[[i, j]], atol=1e-6)
+    assert figure.axes[0].collections
+    with pytest.raises(ValueError, match="2 states"):
+        plot_body(jm.map_feasible_set(mpc, np.zeros((1, 2)), axes=(0, 1), fixed=np.zeros(3)))
 
 
 def test_help_names_them(capsys):

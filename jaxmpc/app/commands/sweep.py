@@ -57,7 +57,8 @@ class Sweep:
 
     How to read the output, all in the folder of --output
       map.png       Blue feasible, grey infeasible, yellow undecided. The true boundary lies
-                    between the dashed line (inner) and the solid one (outer). Two axes only.
+                    between the dashed line (inner) and the solid one (outer). Of three axes
+                    a body and its projections; of others there is none.
       summary.json  Counts, bounds of the area, seconds, configuration, versions.
       sweep.zarr    Each state with its label (1 feasible, -1 infeasible, 0 undecided), its plan,
                     and the half-space cut_normal'x <= cut_offset that no feasible state leaves.
@@ -281,14 +282,18 @@ def run_row(found: StoredMap) -> tuple[str, str]:
 
 
 def conclude(found: StoredMap, config: configs.Config, output: Path, start: float) -> None:
-    """Write the picture of two states and the summary, and print the table."""
+    """Write the picture of two or three states and the summary, and print the table."""
     axes = found.problem.view.axes
     files = [str(found.store.path), str(output / "summary.json")]
-    if len(axes) == 2:
-        from jaxmpc.app.plots.maps import plot_feasible_set
+    if len(axes) in (2, 3):
+        from jaxmpc.app.plots.maps import plot_body, plot_feasible_set
         from jaxmpc.app.plots.style import save
 
-        figure = plot_feasible_set(found.bounds, picture=found.picture()).figure
+        figure: Any = None
+        if len(axes) == 3:
+            figure = plot_body(found.bounds)
+        else:
+            figure = plot_feasible_set(found.bounds, picture=found.picture()).figure
         save(figure, output / "map.png", config.name)
         files.append(str(output / "map.png"))
     low, high = found.bounds.volume_bounds()
@@ -322,8 +327,9 @@ def conclude(found: StoredMap, config: configs.Config, output: Path, start: floa
         ("total", f"{seconds:.2f} s with bounds and files"),
         ("files", " ".join(files)),
     ]
-    if len(axes) != 2:
-        rows.append(("picture", f"none: map.png shows two axes, and this map has {len(axes)}"))
+    if len(axes) not in (2, 3):
+        what = f"none: map.png shows two or three axes, and this map has {len(axes)}"
+        rows.append(("picture", what))
     print_table(rows, 12)
 
 

@@ -8,9 +8,12 @@ from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from scipy.spatial import ConvexHull
 
 from jaxmpc.app.plots.style import (
+    COLUMN,
     FEASIBLE,
+    GRID,
     INFEASIBLE,
     INNER,
     NOT_SOLVED,
@@ -18,6 +21,7 @@ from jaxmpc.app.plots.style import (
     TERMINAL,
     UNDECIDED,
     Style,
+    for_column,
     patch,
 )
 from jaxmpc.checks import fail
@@ -27,6 +31,7 @@ from jaxmpc.recursion.counterexamples import Counterexample
 from jaxmpc.recursion.report import RecursionReport
 from jaxmpc.robot_maps.robot_map import RobotMap
 from jaxmpc.sets.convex_sets import Polytope
+from jaxmpc.sets.drawing import plot
 
 
 def plot_feasible_set(
@@ -59,6 +64,53 @@ def plot_feasible_set(
     handles += draw_bounds(ax, fmap)
     finish(ax, fmap.axis_names, _map_title(fmap), handles)
     return ax
+
+
+def plot_body(fmap: FeasibleSetMap) -> Figure:
+    """Draw the feasible set of three states: its inner bound as a body in space, and inner and
+    outer bound as they are projected onto each pair of states.
+
+    fmap: refined (`FeasibleSetMap.refine`), which proves the bounds. Raises ValueError for a map
+    not of three states.
+    """
+    names = fmap.axis_names
+    if len(names) != 3:
+        fail("fmap", f"maps {len(names)} states", "A body needs 3: choose `axes`")
+    figure = Figure(figsize=(9.6, 8.0), layout="constrained")
+    space = figure.add_subplot(2, 2, 1, projection="3d")
+    inner, outer = _corners(fmap.inner), _corners(fmap.outer)
+    if len(inner):
+        plot(fmap.inner(), ax=space, color=INNER, alpha=0.35)
+    for axis, name in zip("xyz", names, strict=True):
+        getattr(space, f"set_{axis}label")(name, fontsize=9)
+    space.set_title(_map_title(fmap), loc="left", fontsize=11)
+    lines: list[tuple[np.ndarray, str, Style]] = [
+        (outer, "outer bound", {"color": OUTER, "lw": 2.4}),
+        (inner, "inner bound", {"color": INNER, "lw": 1.4, "ls": (0, (3, 3))}),
+    ]
+    for place, (i, j) in zip((2, 3, 4), ((0, 1), (0, 2), (1, 2)), strict=True):
+        ax = figure.add_subplot(2, 2, place)
+        for corners, _, style in lines:
+            if len(corners):
+                shadow = corners[:, [i, j]]
+                around = shadow[ConvexHull(shadow).vertices]
+                ax.plot(*np.vstack([around, around[:1]]).T, solid_joinstyle="round", **style)
+        ax.set_xlabel(names[i])
+        ax.set_ylabel(names[j])
+        ax.set_title("projection", loc="left", fontsize=9)
+        ax.grid(**GRID)
+    handles = [Line2D([], [], label=name, **style) for _, name, style in lines]
+    figure.legend(handles=handles, loc="outside lower left", ncols=2, frameon=False)
+    return figure
+
+
+def _corners(make: Callable[[], Polytope | None]) -> np.ndarray:
+    """Return the vertices (k, 3) of a body; none if there is none, or it is flat or unbounded."""
+    try:
+        polytope = make()
+        return np.zeros((0, 3)) if polytope is None else polytope.require_body().vertices()
+    except ValueError:
+        return np.zeros((0, 3))
 
 
 def _map_title(fmap: FeasibleSetMap) -> str:
@@ -167,8 +219,11 @@ LOST = ("#7a0403", "#b5290a", "#dd5a13", "#f28b30", "#f9b867", "#fbe0ad")
 def draw_recursion(report: RecursionReport) -> Figure:
     """Draw `plot_recursion`, and beside it the counterexample enlarged where there is one."""
     panels = 1 if report.counterexample is None else 2
-    figure = Figure(figsize=(8.4 if panels == 1 else 13, 5.2), layout="constrained")
-    for k, ax in enumerate(figure.subplots(1, panels, squeeze=False)[0]):
+    size, shape = (8.4 if panels == 1 else 13, 5.2), (1, panels)
+    if for_column():
+        size, shape = (COLUMN, 4.2 * panels), (panels, 1)
+    figure = Figure(figsize=size, layout="constrained")
+    for k, ax in enumerate(figure.subplots(*shape, squeeze=False).ravel()):
         plot_recursion(report, ax, enlarge=k == 1)
     return figure
 
@@ -264,8 +319,9 @@ def _draw_counterexample(ax: Axes, worst: Counterexample) -> list[Artist]:
 
 
 def new_axes(width: float = 8.4) -> Axes:
-    """Return the axes of a new figure, with room for a legend on the right."""
-    return Figure(figsize=(width, 4.8), layout="constrained").add_subplot()
+    """Return the axes of a new figure, with room for a legend on the right, in a column below."""
+    size = (width, 4.8) if not for_column() else (COLUMN, 3.6)
+    return Figure(figsize=size, layout="constrained").add_subplot()
 
 
 def draw_bounds(ax: Axes, fmap: FeasibleSetMap, of: str = "") -> list[Line2D]:
@@ -285,11 +341,14 @@ def draw_bounds(ax: Axes, fmap: FeasibleSetMap, of: str = "") -> list[Line2D]:
 
 
 def finish(ax: Axes, names: Sequence[str], title: str, handles: list[Artist]) -> None:
-    """Name the two axes, and set the title and, to the right of the axes, the legend."""
+    """Name the two axes, and set the title and, to the right of the axes, the legend; for a column
+    below them."""
     ax.set_xlabel(names[0])
     ax.set_ylabel(names[1])
-    ax.set_title(title, loc="left", fontsize=11)
+    ax.set_title(title, loc="left", fontsize=8 if for_column() else 11)
     where: Style = {"loc": "upper left", "bbox_to_anchor": (1.02, 1.0)}
+    if for_column():
+        where = {"loc": "upper left", "bbox_to_anchor": (-0.02, -0.18), "ncols": 2, "fontsize": 7}
     ax.legend(handles=handles, frameon=False, handlelength=2.4, **where)
 
 

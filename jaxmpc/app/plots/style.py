@@ -15,10 +15,18 @@ NOT_SOLVED = "#a05fa8"
 EDGE = "#8a8a8a"
 BEFORE, AFTER = "#d55e00", "#0072b2"
 
+# Width in inches of a picture for a column of a paper.
+COLUMN = 3.5
+
 # Keyword arguments of Matplotlib.
 Style = dict[str, Any]
 GRID: Style = {"color": "#ececec", "lw": 0.7}
 SET_POINT: Style = {"color": TERMINAL, "lw": 1.0, "ls": (0, (4, 2))}
+
+
+def for_column() -> bool:
+    """Return whether pictures are for a column: Matplotlib's figure.figsize is that narrow."""
+    return rcParams["figure.figsize"][0] <= COLUMN
 
 
 def save(figure: Any, path: Path | BinaryIO, name: str = "") -> None:
@@ -30,7 +38,7 @@ def save(figure: Any, path: Path | BinaryIO, name: str = "") -> None:
     """
     if name and (title := figure.axes[0].get_title(loc="left")):
         text = f"{name}: {title[0].lower()}{title[1:]}"
-        figure.axes[0].set_title(text, loc="left", fontsize=11)
+        figure.axes[0].set_title(text, loc="left", fontsize=8 if for_column() else 11)
     texts = [t for t in figure.findobj(Text) if not t.get_text().isascii()]
     families = [*rcParams["font.sans-serif"][:1], *_fonts_for("".join(t.get_text() for t in texts))]
     for found in texts:
