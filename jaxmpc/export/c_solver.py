@@ -217,6 +217,7 @@ def check_fixed_steps(
     Raises ValueError for an invalid problem, bounds of another shape than (n,) and bad counts.
     """
     require_kind("mpc", mpc, MPC)
+    require_tightened(mpc, "C code")
     require_kind("solver", solver, ADMM)
     whole("plans", plans, 1)
     number("tolerance", tolerance, 0, "Give a positive number")

@@ -18,6 +18,7 @@ from jaxmpc.checks import number, require_kind, whole
 from jaxmpc.export.c_solver import LOOPS, check_fixed_steps, require_box, starting_states
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.tightening import require_tightened
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status
 
@@ -51,6 +52,7 @@ def choose_steps(
     ValueError as `check_fixed_steps` does.
     """
     require_kind("mpc", mpc, MPC)
+    require_tightened(mpc, "C code")
     number("share", share, 0.0, "Give a fraction from 0 to 1")
     require_box(mpc, lower, upper)
     whole("plans", plans, 1)

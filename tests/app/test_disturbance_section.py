@@ -126,3 +126,15 @@ def test_simulate_refuses(tmp_path, monkeypatch, capsys, options, message):
 def test_a_robot_has_no_disturbance(capsys):
     assert main(["simulate", "--disturbance", "inside"]) == 2
     assert "--disturbance: given for a robot" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["sweep", "export", "info", "tune solver"])
+def test_commands_of_tightened_rows_refuse_others(tmp_path, monkeypatch, capsys, command):
+    """In one sentence, and before anything compiles."""
+    monkeypatch.chdir(tmp_path)
+    text = TEXT.replace("[disturbance]", '[disturbance]\npolicy = "tube"')
+    (tmp_path / "problem.toml").write_text(text)
+    assert main([*command.split(), "--config", "problem.toml"]) == 2
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert "'tube'" in error and 'Give policy="tightened"' in error
+    assert not list(tmp_path.glob("*/*"))

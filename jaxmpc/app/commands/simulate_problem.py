@@ -49,10 +49,11 @@ class LinearLoops:
         share = np.random.default_rng(self.seed).uniform(-1, 1, (self.count, len(lower)))
         return (lower + upper) / 2 + self.spread * share * (upper - lower) / 2
 
-    def run(self, mpc: MPC) -> tuple[Run, np.ndarray]:
-        """Return the loops and what is added to their states (count, steps, n)."""
+    def run(self, mpc: MPC, x0s: np.ndarray) -> tuple[Run, np.ndarray]:
+        """Return the loops from x0s (count, n) and what is added to their states (count, steps,
+        n)."""
         controller = Controller(mpc, self.config.build_solver() or DEFAULT)
-        references, x0s, shape = self.config.references(), self.starts(), (self.count, self.steps)
+        references, shape = self.config.references(), (self.count, self.steps)
 
         def loop(x0: Any, w: Any) -> Run:
             return simulate(controller, mpc.system, x0, self.steps, disturbance=w, **references)
@@ -88,12 +89,13 @@ def simulate_problem(loops: LinearLoops, output: Path, overwrite: bool) -> None:
         fail("limits.input_rate_limit", "given", "Loops of problem files start without an input")
     each = 8 * (3 * mpc.system.n + mpc.system.m + 4) * loops.steps
     require_memory("--count, --seconds", loops.count * each, "Simulate fewer loops, or less time")
+    x0s = loops.starts()
     open_folder(output)
     text = loops.disturbance or "none"
     print(f"{config.name}: {loops.count:,} loops of {loops.steps} steps -> {output}")
     with jax.enable_x64(True), Compiling() as wait:
         wait.begin(f"closed loops of {config.name}", programs=1)
-        run, w = loops.run(mpc)
+        run, w = loops.run(mpc, x0s)
     states, inputs, status = (np.asarray(v) for v in (run.states, run.inputs, run.status))
     planned = status[:, 0] == Status.SOLVED
     limits = (config.state_limits(), states), (mpc.inputs, inputs)

@@ -31,6 +31,7 @@ from jaxmpc.checks import fail
 from jaxmpc.files import as_json, versions, write_json
 from jaxmpc.mpc.controller import solve
 from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.tightening import require_tightened
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status
 from jaxmpc.tuning.result import CHECKPOINT, TuningRun, run_folder
@@ -138,6 +139,7 @@ class TuneSolver:
         overrides = given_options(self, "horizon", "terminal")
         config = configs.load(self.config, overrides, "tune")
         limits, mpc = config.state_limits(), config.build_controlled()
+        require_tightened(mpc, "penalties of the solver")
         ends = initial_range(config.state_range(), self.lower, self.upper)
         options = self.record(config)
         with (
