@@ -150,6 +150,11 @@ def require_real(argument: str, value: Any) -> None:
         fail(argument, f"{found} where real numbers are needed", "Give an array or nested lists")
 
 
+def counted(count: int, what: str) -> str:
+    """Return "1 state" or "2 states"."""
+    return f"{count:,} {what}{'s' * (count != 1)}"
+
+
 def number(argument: str, value: Any, least: float, cure: str) -> None:
     """Raise unless a readable `value` is one number of at least `least`."""
     require_real(argument, value)

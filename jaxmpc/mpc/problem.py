@@ -1,5 +1,6 @@
 """The constrained MPC problem as a user states it, and the same one with soft or hard limits."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from typing import Any, NamedTuple
@@ -274,6 +275,16 @@ class MPC:
         system = self.system
         previous = tuple(f"previous {label}" for label in system.input_labels)
         return system.state_labels + (previous if self.input_in_state else ())
+
+    def volume_unit(self, axes: Sequence[int] | None = None) -> str:
+        """Return the unit of volumes of these coordinates (None: those of feasible sets), with a
+        blank before it, such as " rad·rad/s"; "" where one of them has no unit."""
+        system = self.system
+        units = (system.state_units or ("",) * system.n) + (system.input_units or ("",) * system.m)
+        if axes is None:
+            axes = range(system.n + (system.m if self.rate_limited else 0))
+        chosen = [units[i] for i in axes]
+        return " " + "·".join(chosen) if all(chosen) else ""
 
     @property
     def state_stages(self) -> tuple[int, ...]:

@@ -57,7 +57,7 @@ class RecursionReport:
         if self.counterexample is not None:
             rows.append(("worst", f"{self.counterexample} (found by {self.counterexample.found})"))
         if np.isfinite(self.volume):
-            rows.append(("volume", f"{self.volume:.9g}"))
+            rows.append(("volume", f"{self.volume:.9g}{self.mpc.volume_unit()}"))
         for name, lost in (("lost by any", self.lost_by_any), ("lost by law", self.lost_by_law)):
             if np.isfinite(lost):
                 rows.append((name, f"{lost:.9g}  {lost / self.volume:.4%}"))

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from jaxmpc.arrays import Reals
-from jaxmpc.checks import fail, require_kind, whole
+from jaxmpc.checks import counted, fail, require_kind, whole
 from jaxmpc.closed_loop.simulation import Run, lyapunov_decrease, simulate
 from jaxmpc.explicit.exact_penalties import ExactPenalty, exact_penalty
 from jaxmpc.feasible.boundary_points import boundary
@@ -104,15 +104,17 @@ class OfflineReport:
         mpc, system = self.mpc, self.mpc.system
         span = f" ({mpc.horizon * system.dt:g} s)" if system.dt else ""
         problem = (
-            f"{system.n} states, {system.m} inputs, horizon {mpc.horizon}{span}\n"
-            f"{self.variables} variables, {self.rows} rows, condition of the Hessian "
-            f"{self.condition:.3g}\n{limits_text(mpc)}"
+            f"{counted(system.n, 'state')}, {counted(system.m, 'input')}, "
+            f"horizon {mpc.horizon}{span}\n"
+            f"{counted(self.variables, 'variable')}, {counted(self.rows, 'row')}, "
+            f"condition of the Hessian {self.condition:.3g}\n{limits_text(mpc)}"
         )
         samples = None
         if self.feasible_set is not None:
             low, high = self.volume
             bounded = np.isfinite(high) and high > 0
-            size = f"volume from {low:.9g} to {high:.9g}, " if bounded else ""
+            unit = mpc.volume_unit()
+            size = f"volume from {low:.9g} to {high:.9g}{unit}, " if bounded else ""
             counts = self.feasible_set.counts().items()
             known = ", ".join(f"{count:,} {name}" for name, count in counts if count)
             samples = f"{size}samples: {known}"

@@ -152,6 +152,12 @@ upper = [1.2, 1.2]
     )
     alone = sweep_points(configs.load(path))
     assert alone.axes == (0,) and alone.fixed.tolist() == [0, 0]
+    # Units of the area, where the previous input is mapped too.
+    mpc = config.build_mpc()
+    assert mpc.volume_unit() == ""
+    units = dataclasses.replace(mpc.system, state_units=("m",), input_units=("N",))
+    assert dataclasses.replace(mpc, system=units).volume_unit() == " m·N"
+    assert dataclasses.replace(mpc, system=units).volume_unit([0]) == " m"
 
 
 @pytest.mark.parametrize(

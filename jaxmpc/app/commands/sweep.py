@@ -311,8 +311,7 @@ def conclude(found: StoredMap, config: configs.Config, output: Path, start: floa
     }
     write_results(output / "summary.json", summary)
     what = {1: "length", 2: "area"}.get(len(axes), "volume")
-    units = config.system.state_units
-    unit = " " + "·".join(units[i] for i in axes) if units else ""
+    unit = found.bounds.mpc.volume_unit(axes)
     total = sum(found.counts.values())
     rows = [
         (name, f"{count:>12,}  {count / total:7.2%}")

@@ -24,7 +24,7 @@ from jaxmpc.app.config.problem import (
     section_ends,
 )
 from jaxmpc.batches import CHUNK
-from jaxmpc.checks import fail, nearest, require_memory, require_printable, shown
+from jaxmpc.checks import counted, fail, nearest, require_memory, require_printable, shown
 from jaxmpc.files import text_within
 from jaxmpc.mpc.condense import condensed_bytes
 
@@ -239,7 +239,8 @@ def check(config: Config, command: str = "sweep") -> None:
         ("reference.input", None if target is None else target.input, m),
     ):
         if value is not None and len(value) != count:
-            what = f"{m} inputs" if count == m != n else f"{n} states, {m} inputs"
+            inputs = counted(m, "input")
+            what = inputs if count == m != n else f"{counted(n, 'state')}, {inputs}"
             fail(key, f"has {len(value)} entries where {count} are needed", f"A, B: {what}")
     _check_order("limits", limits, "x_min", "x_max")
     _check_order("limits", limits, "u_min", "u_max")
