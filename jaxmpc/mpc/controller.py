@@ -464,7 +464,7 @@ def solve(
     previous_input: u_{−1} (m,) where the problem limits or weighs input rates; None for zero.
     forecast: disturbance that is known ahead, (n,) or (N, n), row k of which is added to x_{k+1};
     None for zero.
-    warm_start: an earlier Plan or a WarmStart.
+    warm_start: an earlier Plan or a WarmStart; affine policies and tubes make no use of it.
 
     `jax.vmap(solve, in_axes=(None, 0))(mpc, x0s)` solves for many states and factors
     once. Raises ValueError for an ill-posed problem or wrong shapes, before any compile; what

@@ -137,21 +137,46 @@ def test_affine_plans_are_the_best_of_all():
         assert worst_rows(mpc, np.stack(x, 1), u) < 2e-6
 
 
-def test_rows_of_tubes_have_a_solution_where_the_map_says_so():
-    """By a linear program of SciPy over the rows of the condensed problem."""
-    mpc = robust("tube")
-    states, labels = labelled(mpc)
+def least_first_inputs(mpc: jm.MPC, states: np.ndarray) -> np.ndarray:
+    """Return the least first input over the rows of the condensed problem, ∞ where they have no
+    solution: linear programs of SciPy."""
     with enable_x64():
         c = jax.tree.map(np.asarray, jm.Controller(mpc).condensed)
-    some = []
+    least = []
     for x0 in states:
         low, high = (side - c.D @ x0 - c.d for side in (c.lower, c.upper))
         above, below = np.isfinite(high), np.isfinite(low)
         rows = np.vstack([c.C[above], -c.C[below]])
         bounds = np.append(high[above], -low[below])
-        some.append(linprog(np.zeros(rows.shape[1]), rows, bounds, bounds=(None, None)).status)
-    np.testing.assert_array_equal(np.array(some) == 0, labels == 1)
+        found = linprog(np.eye(rows.shape[1])[0], rows, bounds, bounds=(None, None))
+        least.append(found.fun if found.status == 0 else np.inf)
+    return np.array(least)
+
+
+def test_rows_of_tubes_have_a_solution_where_the_map_says_so():
+    mpc = robust("tube")
+    states, labels = labelled(mpc)
+    np.testing.assert_array_equal(np.isfinite(least_first_inputs(mpc, states)), labels == 1)
     assert 0 < np.sum(labels == 1) < len(labels)
+
+
+def test_forms_of_one_set_of_disturbances():
+    """A box, a zonotope of two generators, and a zonotope through E give the same plans."""
+    box = jm.Box([-0.08], [0.18])
+    zonotope = jm.sets.Zonotope([0.05], [[0.1, -0.03]])
+    along = jm.sets.Zonotope([0.025, 0.05], [[0.065], [0.13]])
+    E, last = np.array([[0.5], [1.0]]), jm.Box([-1.0, -1.0], [1.0, 1.0])
+    forms = (
+        {"disturbance": box, "disturbance_matrix": E},
+        {"disturbance": zonotope, "disturbance_matrix": E},
+        {"disturbance": along},
+    )
+    each = [
+        least_first_inputs(robust("affine", terminal_set=last, **form), STATES) for form in forms
+    ]
+    assert 0 < np.isfinite(each[0]).sum() < len(STATES)
+    np.testing.assert_allclose(each[1], each[0], atol=1e-8)
+    np.testing.assert_allclose(each[2], each[0], atol=1e-8)
 
 
 @pytest.mark.slow
