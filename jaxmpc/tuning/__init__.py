@@ -4,6 +4,7 @@ tune_weights                              fields of an MPC, through its closed l
 linear_task, robot_task                   what `jaxmpc tune weights` tunes: loops, loss, weights
 weight_parameters, feasible_states        its parameters, and initial states that have a plan
 run_folder                                the folder of a run that is resumed or overwritten
+MPCLayer                                  an MPC problem in a network, some of its data learned
 Parameter                                 a quantity that is tuned, and its domain
 ClosedLoopLoss                            tracking, effort, violations and settling
 tune_feasible_set                         the share of states from which all limits can be kept
@@ -12,6 +13,7 @@ Interrupted                               what all of these raise on Ctrl-C, wit
 """
 
 from jaxmpc.tuning.feasible_set import tune_feasible_set
+from jaxmpc.tuning.layer import MPCLayer
 from jaxmpc.tuning.losses import ClosedLoopLoss
 from jaxmpc.tuning.parameters import Parameter
 from jaxmpc.tuning.result import Interrupted, run_folder
@@ -22,6 +24,7 @@ from jaxmpc.tuning.weights import tune_weights
 __all__ = [
     "ClosedLoopLoss",
     "Interrupted",
+    "MPCLayer",
     "Parameter",
     "feasible_states",
     "linear_task",

@@ -1,0 +1,161 @@
+"""An MPC problem as a layer of a network: free parameters, and a pure function of them.
+
+The layer keeps the problem, which nothing trains; what is learned are free real numbers θ, a dict
+of arrays that any optimiser, module or checkpoint takes. `Parameter` maps them to weights that stay
+positive definite, and so on. The derivative of a plan is that of the solution of its program
+(Amos et al. 2018, Agrawal et al. 2019, NeurIPS), see `ADMM.differentiate` and `ADMM.smoothing`.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import reduce
+from operator import attrgetter
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxmpc.arrays import Reals, host_array
+from jaxmpc.checks import concrete, fail, require_kind
+from jaxmpc.mpc.controller import Controller
+from jaxmpc.mpc.plan import Control, Plan
+from jaxmpc.mpc.problem import MPC
+from jaxmpc.qp.admm import ADMM, DEFAULT
+from jaxmpc.tuning.parameters import Parameter, exact_values, raw, require_parameters, values
+
+# Short names of what lies in the system.
+SHORT = {"A": "system.A", "B": "system.B", "c": "system.c"}
+# Fields whose values are positive definite matrices, and others that stay positive.
+MATRICES = ("Q", "R", "terminal_cost", "input_rate_weight")
+POSITIVE = ("stage_weights", "rho", "quadratic", "radius")
+
+
+class MPCLayer:
+    """A differentiable MPC problem with some of its data learned: θ, x ↦ the input and its plan.
+
+        layer = jm.tuning.MPCLayer(mpc, learn=("Q", "R", "A"))
+        theta = layer.init()                        # {"Q": ..., "R": ..., "A": ...}, free numbers
+        u = jax.vmap(layer, (None, 0))(theta, x).u  # (B, m), within the limits of the inputs
+
+    Arguments:
+        mpc: The problem; what is not learned stays as it is here.
+        learn: Names of fields of the problem: "Q", "R", "terminal_cost", "stage_weights", …, with a
+            dot those of its parts, "inputs.upper", "soft.rho"; "A", "B", "c" of the system. Or a
+            mapping of such names to a `Parameter`, which says the domain, the start and the entries
+            that are trained. Without one Q, R and other weights stay diagonal where they are, and
+            positive definite; penalties stay positive; all else is real.
+        solver: Settings of the solver: `smoothing` for derivatives that see limits before they are
+            reached, `eps`, and so on.
+
+    A layer is no pytree: in a module of Equinox mark it as static, in one of Flax it is already. It
+    may be called in `jax.jit`, `jax.vmap`, `jax.grad`, `jax.lax.scan`. Raises ValueError for names
+    that the problem does not have, for values that are not there (None), not finite or outside
+    their domain.
+    """
+
+    def __init__(
+        self,
+        mpc: MPC,
+        learn: Sequence[str] | Mapping[str, Parameter] = ("Q", "R"),
+        solver: ADMM = DEFAULT,
+    ) -> None:
+        require_kind("mpc", mpc, MPC)
+        require_kind("solver", solver, ADMM)
+        if not concrete(mpc):
+            fail("mpc", "holds traced arrays", "Make the layer outside jax.jit, and learn these")
+        names = [learn] if isinstance(learn, str) else list(learn)
+        given = learn if isinstance(learn, Mapping) else {}
+        parts = {name: _at(mpc, name) for name in names}
+        found = {n: given[n] if given else _parameter(n, value) for n, value in parts.items()}
+        if not found:
+            fail("learn", "names nothing", 'Give names of what is learned, such as ("Q", "R")')
+        require_parameters(found)
+        for name, parameter in found.items():
+            if np.shape(parameter.value) != np.shape(parts[name]):
+                shape = np.shape(parameter.value)
+                fail(f"learn[{name!r}]", f"shape {shape}", f"Needed: {np.shape(parts[name])}")
+        self.mpc, self.solver, self.parameters = mpc, solver, found
+        Controller(mpc, solver)  # says what is wrong with the problem
+
+    def __repr__(self) -> str:
+        learned = ", ".join(f"{name} ({p.domain})" for name, p in self.parameters.items())
+        return f"MPCLayer(horizon {self.mpc.horizon}, learns {learned})"
+
+    def init(self) -> dict[str, Array]:
+        """Return θ at which the problem is as given: {name: (k,)}, entries that are trained."""
+        return {name: jnp.asarray(v) for name, v in raw(self.parameters).items()}
+
+    def values(self, theta: Mapping[str, Any]) -> dict[str, np.ndarray]:
+        """Return what is learned at θ, as NumPy arrays."""
+        return exact_values(self.parameters, theta)
+
+    def problem(self, theta: Mapping[str, Any]) -> MPC:
+        """Return the problem at θ, for any function that takes one. Works inside jit and grad."""
+        if set(theta) != set(self.parameters):
+            given, needed = ", ".join(theta), ", ".join(self.parameters)
+            fail("theta", f"has the names {given or 'none'}", f"Needed: {needed}, as from init()")
+        found = values(self.parameters, theta)
+        return reduce(lambda mpc, name: _with(mpc, _path(name), found[name]), found, self.mpc)
+
+    def controller(self, theta: Mapping[str, Any]) -> Controller:
+        """Return the controller at θ: of many calls with one θ, such as a closed loop, the problem
+        is condensed and factored once."""
+        return Controller(self.problem(theta), self.solver)
+
+    def start(self, theta: Mapping[str, Any], x: Reals) -> Control[Plan]:
+        """Return what stands for the time step before the first, to carry through
+        `jax.lax.scan`."""
+        return self.controller(theta).start(jnp.asarray(x))
+
+    def __call__(
+        self,
+        theta: Mapping[str, Any],
+        x: Reals,
+        before: Control[Plan] | None = None,
+        reference: Reals | None = None,
+        **aim: Any,
+    ) -> Control[Plan]:
+        """Return the input u (m,) at x (n,), its plan, and what the next call goes on from.
+
+        before: what the last call returned, for a warm start; None for none. reference, aim
+        (input_reference, previous_input, forecast): as in `jm.solve`. u is within the limits of the
+        inputs if these are a Box, and finite, also where there is no plan; `plan.solved` is the
+        mask of a loss.
+        """
+        return self.controller(theta)(x, before, reference, **aim)
+
+
+def _path(name: str) -> list[str]:
+    return SHORT.get(name, name).split(".")
+
+
+def _at(mpc: MPC, name: str) -> np.ndarray:
+    """Return what lies at a name in the problem; ValueError where there is nothing."""
+    try:
+        value = attrgetter(".".join(_path(name)))(mpc)
+    except AttributeError:
+        known = 'such as "Q", "R", "terminal_cost", "A", "B", "c", "inputs.upper"'
+        fail("learn", f"{name!r} is no field of the problem", f"Give names {known}")
+    if value is None:
+        fail("learn", f"{name!r} is None in the problem", "Give it a value to start from")
+    if not isinstance(value, float | int | np.ndarray | Array):
+        kind = type(value).__name__
+        fail("learn", f"{name!r} is a {kind} in the problem", "Name an array, such as a part of it")
+    return host_array(name, value)
+
+
+def _parameter(name: str, value: np.ndarray) -> Parameter:
+    """Return the parameter that starts at the value, in the domain of its field."""
+    field = _path(name)[-1]
+    if field in MATRICES and value.ndim == 2:
+        diagonal = np.array_equal(value, np.diag(np.diag(value)))
+        return Parameter(value, "diagonal" if diagonal else "definite")
+    return Parameter(value, "positive" if field in (*MATRICES, *POSITIVE) else "real")
+
+
+def _with(part: Any, path: list[str], value: Array) -> Any:
+    """Return the problem, or a part of it, with another value at a path."""
+    first, *rest = path
+    inner = _with(getattr(part, first), rest, value) if rest else value
+    return replace(part, **{first: inner})

@@ -1,0 +1,127 @@
+"""An MPC as a layer: what it returns, its derivatives, and what it refuses."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import approx_fprime
+
+import jaxmpc as jm
+
+A, B = np.array([[1, 0.1], [0, 1]]), np.array([[0.005], [0.1]])
+MPC = jm.MPC(
+    jm.LinearSystem(A, B),
+    np.array([[2, 0.3], [0.3, 1]]),
+    np.eye(1),
+    horizon=4,
+    states=jm.Box([-1, -1], [1, 1]),
+    inputs=jm.Box([-0.5], [0.5]),
+    soft=jm.Soft(np.eye(2), [-0.6, -0.6], [0.6, 0.6], rho=0.4),
+)
+NAMES = ("Q", "R", "A", "B", "inputs.upper", "soft.rho")
+
+
+@pytest.fixture
+def x64():
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture(scope="module")
+def layer():
+    return jm.tuning.MPCLayer(MPC, NAMES)
+
+
+def test_at_the_start_it_is_the_problem(layer, x64):
+    """And free numbers lead back to what they stand for."""
+    theta = layer.init()
+    assert set(theta) == set(NAMES)
+    for name, value in layer.values(theta).items():
+        expected = {"Q": MPC.Q, "R": MPC.R, "A": A, "B": B, "inputs.upper": [0.5]}.get(name, 0.4)
+        np.testing.assert_allclose(value, expected, rtol=1e-14, atol=1e-14)
+    x = np.array([[0.5, 0.2], [-0.9, 0.4]])
+    found = jax.jit(jax.vmap(layer, (None, 0)))(theta, x)
+    np.testing.assert_allclose(found.plan.inputs, jm.solve_many(MPC, x).inputs, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_derivatives_are_those_of_differences(layer, name, x64):
+    """Of a loss over states at which inputs, and soft rows, are at their limits."""
+    x = jnp.array([[-0.7, -0.4], [0.85, 0.3], [0.2, 0.1], [0.55, 0.9]])
+    theta = layer.init()
+
+    @jax.jit
+    def loss(value):
+        return jnp.sum(jnp.sin(jax.vmap(layer, (None, 0))(theta | {name: value}, x).plan.inputs))
+
+    start = np.asarray(theta[name])
+    expected = approx_fprime(start, lambda v: float(loss(jnp.asarray(v))), 1e-6)
+    scale = max(1.0, np.abs(expected).max())
+    np.testing.assert_allclose(jax.grad(loss)(theta[name]), expected, atol=2e-5 * scale)
+
+
+def test_what_is_not_learned_is_fixed():
+    layer = jm.tuning.MPCLayer(MPC, {"A": jm.Parameter(A, train=A == 0.1)})
+    theta = layer.init()
+    assert {name: v.shape for name, v in theta.items()} == {"A": (1,)}
+    moved = layer.problem({"A": theta["A"] + 1}).system.A
+    np.testing.assert_allclose(moved, [[1, 1.1], [0, 1]])
+    assert not jax.tree.leaves(layer) or jax.tree.leaves(layer) == [layer]  # no pytree
+
+
+def test_inputs_without_a_plan_are_within_the_limits():
+    """A state far off spoils neither its neighbours nor their gradients."""
+    layer = jm.tuning.MPCLayer(MPC)
+    x = jnp.array([[0.5, 0.2], [50.0, 3.0], [jnp.nan, 0.0]])
+
+    def loss(theta):
+        found = jax.vmap(layer, (None, 0))(theta, x)
+        return jnp.sum(found.u, where=found.plan.solved[:, None]), found
+
+    (_, found), gradient = jax.value_and_grad(loss, has_aux=True)(layer.init())
+    assert found.plan.solved.tolist() == [True, False, False]
+    assert (np.abs(found.u) <= 0.5).all()
+    alone = jax.grad(lambda theta: layer(theta, x[0]).u[0])(layer.init())
+    for name, value in gradient.items():
+        np.testing.assert_allclose(value, alone[name], rtol=1e-4, atol=1e-6)
+
+
+def test_a_closed_loop_carries_its_plans(layer):
+    theta = layer.init()
+
+    @jax.jit
+    def states(theta, x):
+        def step(carry, _):
+            x, before = carry
+            before = layer(theta, x, before)
+            return (A @ x + B @ before.u, before), x
+
+        return jax.lax.scan(step, (x, layer.start(theta, x)), length=60)[1]
+
+    x = states(theta, jnp.array([0.8, 0.0]))
+    assert np.abs(x[-1]).max() < 0.3 * np.abs(x[0]).max()
+    assert all(np.isfinite(v).all() for v in jax.jacobian(states)(theta, x[0]).values())
+
+
+@pytest.mark.parametrize(
+    ("learn", "words"),
+    [
+        ("q", "'q' is no field"),
+        ("c", "'c' is None in the problem"),
+        ("states", "'states' is a Box in the problem"),
+        ((), "names nothing"),
+        ({"Q": jm.Parameter(np.eye(3), "definite")}, r"learn\['Q'\]: shape \(3, 3\)"),
+        ({"Q": np.eye(2)}, "Wrap it in a jm.Parameter"),
+        ({"Q": jm.Parameter(np.eye(2), train=False)}, "none is trained"),
+    ],
+)
+def test_refuses(learn, words):
+    with pytest.raises(ValueError, match=words):
+        jm.tuning.MPCLayer(MPC, learn)
+
+
+def test_refuses_other_parameters(layer):
+    with pytest.raises(ValueError, match="theta: has the names Q"):
+        layer({"Q": jnp.zeros(3)}, np.zeros(2))
+    with pytest.raises(ValueError, match="holds traced arrays"):
+        jax.jit(lambda Q: jm.tuning.MPCLayer(jm.MPC(MPC.system, Q, np.eye(1), 3)).init())(np.eye(2))
