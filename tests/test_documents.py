@@ -79,6 +79,15 @@ def holds_tuning(after, said):
     assert after[-1]["solver"].rho.shape[0] == 4
 
 
+def holds_learning(after, said):
+    """The expert's inputs are found; modules have gradients of both their parts."""
+    assert after[1]["value"] < 1e-6
+    theta, network = after[2]["gradient"].theta, after[2]["gradient"].network
+    assert all(np.abs(v).max() > 0 for v in (*theta.values(), network.layers[0].weight))
+    assert np.abs(after[3]["gradient"]["theta"].get_value()["Q"]).max() > 0
+    assert after[4]["states"].shape == (64, 20, 2)
+
+
 def holds_theory(after, said):
     """Theorem 1 holds of the design, and the weight it advises is exact."""
     assert "Theorem 1 (recursive feasibility) applies" in said and "weight given is exact" in said
@@ -93,6 +102,7 @@ def holds_offset_free(after, said):
 
 
 HOLDS = {
+    "docs/how-to/learning.md": holds_learning,
     "docs/how-to/offset-free.md": holds_offset_free,
     "docs/how-to/robots.md": holds_robots,
     "docs/how-to/tuning.md": holds_tuning,
