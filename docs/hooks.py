@@ -13,6 +13,9 @@ from latex2mathml.converter import convert
 from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).resolve().parents[1]
+# Address of the repository, where it is known: for a link in the footer, and notebooks in Colab.
+# (The link of the theme itself asks GitHub for numbers when a page is read.)
+REPOSITORY = os.environ.get("JAXMPC_REPOSITORY", "")
 # Links of pages to files outside docs/, and where these are on the site.
 MOVED = {"CHANGELOG.md": "changelog.md"}
 # Formulas wait here, under a word that Markdown leaves alone, until the page is HTML.
@@ -25,6 +28,8 @@ def on_config(config: Any) -> Any:
     version = re.search(r'__version__ = "(.*)"', text)
     assert version is not None
     config.copyright = f"jaxmpc {version[1]}, Apache License 2.0"
+    if REPOSITORY:
+        config.copyright += f' · <a href="{html.escape(REPOSITORY)}">Repository</a>'
     return config
 
 
@@ -34,11 +39,12 @@ def on_files(files: Files, config: Any) -> Files:
     files.append(File.generated(config, "changelog.md", content=changelog))
     for path in sorted((ROOT / "notebooks").glob("[0-9]*.ipynb")):
         text, pictures = page_of(path)
-        address = config.repo_url or ""
-        if "//github.com/" in address:
-            place = address.split("//github.com/")[1].rstrip("/")
+        if "//github.com/" in REPOSITORY:
+            place = REPOSITORY.split("//github.com/")[1].rstrip("/")
             colab = f"https://colab.research.google.com/github/{place}/blob/main/notebooks/"
-            text = text.replace("\n\n", f"\n\n[Open in Colab]({colab}{path.name}). ", 1)
+            first = f"`!pip install 'jaxmpc[robots] @ git+{REPOSITORY}'`"
+            link = f"[Open in Colab]({colab}{path.name}), and run {first} there first. "
+            text = text.replace("\n\n", f"\n\n{link}", 1)
         files.append(File.generated(config, f"notebooks/{path.stem}.md", content=text))
         files.append(File.generated(config, f"notebooks/{path.name}", content=path.read_bytes()))
         for name, picture in pictures.items():

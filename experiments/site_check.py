@@ -143,6 +143,8 @@ def main() -> int:
     arguments = parser.parse_args()
     here = serve(arguments.site)
     chosen = [name for name in pages(arguments.site) if arguments.only in name]
+    if not chosen:
+        parser.error(f"{arguments.site} has no such page")
     wrong = 0
     with sync_playwright() as player:
         browser = player.chromium.launch(executable_path=shutil.which("chromium"))
