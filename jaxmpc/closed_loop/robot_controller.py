@@ -449,6 +449,9 @@ def _prepared(given: RobotController, solver: ADMM) -> dict[str, Any]:
     if mpc.disturbance is not None and linearize != "set-point":
         what = "given, and its rows are tightened for one linear model"
         fail("mpc.disturbance", what, 'Give linearize="set-point", or leave it out')
+    if stands(robot) and linearize != "set-point":
+        what = f"{linearize!r} of a robot whose feet stand, whose friction cones are of one model"
+        fail("linearize", what, 'Give linearize="set-point"')
     soft = _softened(mpc, given.rho)
     if linearize == "set-point":
         return {"soft": arrays(soft), "fixed": Controller(soft, solver), "scale": None}

@@ -2,6 +2,7 @@
 statics against a linear program, and what is refused."""
 
 import copy
+import importlib.util
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -42,6 +43,12 @@ def hopper():
     height, shift = 0.6 * np.cos(BEND) + 0.0299, 0.7 * 0.15 * np.sin(BEND) / 5
     text = HOPPER.format(height=height, shift=shift, bend=BEND, back=-2 * BEND)
     return jm.load_robot(mujoco.MjModel.from_xml_string(text))
+
+
+@pytest.fixture(scope="module")
+def quadruped():
+    """The quadruped, of which nothing stands yet."""
+    return jm.load_robot(QUADRUPED)
 
 
 @pytest.fixture(scope="module")
@@ -96,6 +103,7 @@ def period(robot, x, u):
     return np.append(q, v)
 
 
+@pytest.mark.slow
 def test_rest_on_a_foot(standing):
     """The foot carries the weight, and the linear model rests there."""
     x, u = standing.equilibrium()
@@ -110,6 +118,7 @@ def test_rest_on_a_foot(standing):
     np.testing.assert_allclose(after, host_coordinates(standing, x), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_linear_model_against_the_c_engine(standing):
     """A and B of a period are the slopes of the balance of forces, cones of its forces."""
     x, u = standing.equilibrium()
@@ -136,9 +145,9 @@ def test_linear_model_against_the_c_engine(standing):
     np.testing.assert_allclose(slack, 0.5 * 9.81 * standing.mujoco.body_mass.sum(), rtol=1e-9)
 
 
-def test_statics_of_four_feet():
-    """Torques and forces of rest are those of a linear program; without torque nothing rests."""
-    robot = jm.load_robot(QUADRUPED).standing(FEET)
+def test_statics_of_four_feet(quadruped):
+    """Torques of rest need what a linear program finds: normal forces alone, of the weight."""
+    robot = quadruped.standing(FEET)
     feet, model = robot.predictor.feet, robot.predictor.model
     np.testing.assert_allclose(feet.friction, 0.8)  # 80 % of the file's 1
     np.testing.assert_allclose(feet.frames[:, 0], [[0, 0, 1]] * 4, atol=1e-12)
@@ -156,36 +165,80 @@ def test_statics_of_four_feet():
     found = linprog(cost, A_eq=parts, b_eq=left, bounds=(0, None))
     assert found.status == 0 and found.x[4:].sum() < 0.1  # N: hardly any friction is needed
     np.testing.assert_allclose(found.x[:4].sum(), 9.81 * model.body_mass.sum(), rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_weak_motors_hold_no_robot(quadruped):
+    """With motors of 1 N m neither a linear program finds forces of rest, nor the library."""
+    robot = quadruped.standing(FEET)
     weak = replace(robot, input_limits=jm.Box(np.full(12, -1.0), np.ones(12)))
-    within = np.hstack([parts, actuation])
-    bounds = [(0, None)] * parts.shape[1] + [(-1, 1)] * model.nu
-    refused = linprog(np.zeros(within.shape[1]), A_eq=within, b_eq=data.qfrc_bias, bounds=bounds)
-    assert refused.status == 2
+    model, data = robot.predictor.model, mujoco.MjData(robot.predictor.model)
+    data.qpos[:] = robot.home[: model.nq]
+    mujoco.mj_forward(model, data)
+    J = robot.predictor.feet.jacobian(model, data)
+    sideways = np.concatenate([J[1::3], J[2::3]]).T
+    parts = np.hstack([J[::3].T, sideways, -sideways, np.eye(model.nv, model.nu, -6)])
+    bounds = [(0, None)] * 20 + [(-1, 1)] * model.nu
+    found = linprog(np.zeros(32), A_eq=parts, b_eq=data.qfrc_bias, bounds=bounds)
+    assert found.status == 2
     with pytest.raises(ValueError, match="no input balances the forces"):
         weak.equilibrium()
     with pytest.raises(ValueError, match="cannot stand at home"):
         weak.set_point()
 
 
-def test_what_cannot_stand_is_named(standing):
+def test_what_cannot_stand_is_named(quadruped):
     """Geoms that are no feet, feet in the air, models that are not stepped."""
-    robot = standing
     for feet, message in (
-        (["toe"], "feet: no geom is named 'toe'. Name one of the geoms: floor, trunk, foot"),
-        (["trunk"], "feet: geom trunk is no sphere"),
-        (["foot", "foot"], "has a name twice"),
-        ("foot", "Give the names of geoms"),
+        (["toe"], "feet: no geom is named 'toe'. Name one of the geoms: floor, FL, FR, RL, RR"),
+        (["floor"], "feet: geom floor is no sphere"),
+        (["FL", "FL"], "has a name twice"),
+        ("FL", "Give the names of geoms"),
         ([], "Give the names of geoms"),
     ):
         with pytest.raises(ValueError, match=message):
-            robot.standing(feet)
+            quadruped.standing(feet)
     with pytest.raises(ValueError, match="friction: -1"):
-        robot.standing(["foot"], friction=-1)
-    for raised, message in ((0.02, "foot is 0.0199 m from the ground at home"), (0.5, "is far")):
-        home = robot.home + raised * np.eye(robot.state_size)[2]
+        quadruped.standing(FEET, friction=-1)
+    for raised, message in ((0.02, "FL is 0.0199 m from the ground at home"), (0.5, "FL is far")):
+        home = quadruped.home + raised * np.eye(quadruped.state_size)[2]
         with pytest.raises(ValueError, match=message):
-            replace(robot, home=home).standing(["foot"])
-    model = copy.deepcopy(robot.predictor.model)
+            replace(quadruped, home=home).standing(FEET)
+    model = copy.deepcopy(quadruped.predictor.model)
     model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
     with pytest.raises(ValueError, match="RK4"):
-        replace(robot, predictor=SimpleNamespace(model=model)).standing(["foot"])
+        replace(quadruped, predictor=SimpleNamespace(model=model)).standing(FEET)
+    robot = quadruped.standing(FEET)
+    assert "feet that stand in linear models: FL, FR, RL, RR" in str(robot.report())
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+def test_pushed_quadrupeds_stand():
+    """Two quadrupeds, pushed by 60 % of what the pendulum bounds, stand on their friction cones."""
+    spec = importlib.util.spec_from_file_location("standing", QUADRUPED.with_name("standing.py"))
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    with jax.enable_x64(True):
+        robot = module.quadruped(0.01)
+        x, u = robot.equilibrium()
+        rest, directions = module.Rest(robot, x), np.array([[0.0, 1], [1, 0]])
+        # The polygon of the feet: 0.19 m and 0.127 m from the centre of mass, but for its offset.
+        reach = rest.survivable(directions)[:, None] / rest.survivable(-directions)[:, None]
+        np.testing.assert_allclose(reach, 1, atol=0.15)
+        added = module.pushes(
+            robot, rest, 0.6 * rest.survivable(directions)[:, None] * directions, 80
+        )
+        goal = {"reference": robot.coordinates(x), "input_reference": u}
+        law = module.standing_mpc(robot)
+        with pytest.raises(ValueError, match="linearize: 'state' of a robot whose feet stand"):
+            jm.RobotController(robot, law.mpc)
+        run = jm.simulate_many(law, robot, np.tile(x, (2, 1)), 80, disturbances=added, **goal)
+    assert np.all(run.status == jm.Status.SOLVED) and not run.fallback.any()
+    assert module.stood(run.states).all()
+    assert np.abs(run.states[:, :, :2]).max() > 0.02  # they were pushed indeed
+    normal, share, error = module.of_feet(robot, run)
+    assert error.max() < 1e-8
+    late = slice(60, None)
+    np.testing.assert_allclose(normal[:, late].sum(axis=2), 9.81 * rest.mass, rtol=0.1)
+    assert share[:, late][normal[:, late] > 1].max() < 0.9
