@@ -160,6 +160,7 @@ def test_rows_of_tubes_have_a_solution_where_the_map_says_so():
     assert 0 < np.sum(labels == 1) < len(labels)
 
 
+@pytest.mark.slow
 def test_forms_of_one_set_of_disturbances():
     """A box, a zonotope of two generators, and a zonotope through E give the same plans."""
     box = jm.Box([-0.08], [0.18])
