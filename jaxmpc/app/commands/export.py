@@ -20,6 +20,7 @@ from jaxmpc.app.commands.options import (
 )
 from jaxmpc.checks import fail
 from jaxmpc.explicit.regions import critical_regions
+from jaxmpc.export.c_files import CFiles
 from jaxmpc.export.c_law import export_explicit_c
 from jaxmpc.export.c_solver import TOLERANCE, check_fixed_steps, export_c
 from jaxmpc.export.jax_program import export_jax
@@ -98,7 +99,8 @@ class Export:
         dtype: Literal["float32", "float64"] = "float32" if self.single else "float64"
         tolerance = TOLERANCE[dtype] if self.tolerance is None else self.tolerance
         rows: list[tuple[str, str]] = []
-        if chosen:
+        if chosen:  # what is wrong with the files is said before the work
+            CFiles.open(self.output, self.name, dtype, tolerance, TOLERANCE, self.overwrite)
             print("choosing steps along closed loops; some 20 s", file=sys.stderr)
             solver = choose_steps(
                 mpc,
