@@ -42,7 +42,7 @@ class Settings:
     """loops: robots of each task. seconds: of motion. modes: linearisations of the MPC. spread:
     of the starts, rad and (times 4) rad/s. speed: of the sinusoid, in velocity limits. velocity:
     limits in place of the file's, times theirs. margin: of `robot_mpc`. sqp: quadratic programs a
-    sample at most. masses: each body's mass is off by up to this share. noise: standard deviation
+    sample at most. hessian: of "sqp". masses: each body's mass is off by up to this share. noise: standard deviation
     of measured positions (rad, m)."""
 
     robot: str = "arm2"
@@ -55,6 +55,7 @@ class Settings:
     velocity: float = 0.5
     margin: float = 0.02
     sqp: int = 10
+    hessian: str = "gauss-newton"
     masses: float = 0.0
     noise: float = 0.0
     seed: int = 0
@@ -91,8 +92,8 @@ def laws(s: Settings, robot: Robot) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for mode in s.modes:
         how = {"linearize": mode} if mode != "sqp" else {"linearize": "trajectory"}
-        count = s.sqp if mode == "sqp" else 1
-        found[f"MPC, {mode}"] = jm.RobotController(robot, mpc, **how, sqp_steps=count)
+        settings = {"sqp_steps": s.sqp, "hessian": s.hessian} if mode == "sqp" else {}
+        found[f"MPC, {mode}"] = jm.RobotController(robot, mpc, **how, **settings)
     found["LQR, clipped"] = LinearFeedback(mpc, jm.lqr(mpc.system, mpc.Q, mpc.R).K, robot)
     if robot.m == nv:
         # PD of 20 rad/s and critical damping, with the inertias at home.

@@ -242,8 +242,9 @@ class RobotController:
       the gripper; with "trajectory" only. Their targets are the columns of `reference` after the
       first n, or those of the tasks where the reference has just n.
     sqp_steps: quadratic programs a time step at most. With "trajectory" more than one solve the
-      nonlinear problem (`solve_nonlinear`, Gauss and Newton's Hessian), and the status is that of
-      the nonlinear problem.
+      nonlinear problem (`solve_nonlinear`), and the status is that of the nonlinear problem.
+    hessian: as in `solve_nonlinear`, with sqp_steps > 1. "exact" needs fewer quadratic programs
+      and, for its second derivatives of the robot, minutes to compile.
     rho: L1 weight (cost per unit) with which state limits and terminal rows are soft. Where it
       exceeds the multipliers of the hard problem, plans keep the limits whenever the model can
       (exact penalty), and elsewhere trade violations against the cost by that weight. Each such
@@ -268,6 +269,7 @@ class RobotController:
     rho: Any
     tasks: tuple[Task, ...]
     sqp_steps: int = static()
+    hessian: str = static()
     soft: Any = field(init=False)
     fixed: Controller | None = field(init=False)
     scale: Any = field(init=False)
@@ -282,12 +284,13 @@ class RobotController:
         rho: Reals = 1e4,
         tasks: tuple[Task, ...] = (),
         sqp_steps: int = 1,
+        hessian: str = "gauss-newton",
     ) -> None:
         solver = DEFAULT if solver is None else solver
         if solver.iterations is None and linearize != "set-point":
             solver = replace(solver, iterations=0)
         vars(self).update(robot=robot, mpc=mpc, linearize=linearize, rho=rho, tasks=tuple(tasks))
-        vars(self).update(exact=exact or sqp_steps > 1, sqp_steps=sqp_steps)
+        vars(self).update(exact=exact or sqp_steps > 1, sqp_steps=sqp_steps, hessian=hessian)
         vars(self).update(_prepared(self, solver), solver=arrays(solver))
 
     @property
@@ -368,7 +371,8 @@ class RobotController:
                 start = WarmStart(*self._resting(x, input_reference), blank)
             start = anchored(start, xi)
             reference, targets = self._targets(problem, reference)
-            given |= {"iterations": self.sqp_steps, "hessian": "gauss-newton", "targets": targets}
+            given |= {"iterations": self.sqp_steps, "hessian": self.hessian}
+            given["targets"] = targets
             plan = solve_nonlinear(problem, xi, reference, self.solver, start, **given)
         else:
             inputs = self._resting(x, input_reference)[1] if memory is None else memory.inputs
@@ -443,6 +447,10 @@ def _prepared(given: RobotController, solver: ADMM) -> dict[str, Any]:
         needed = f"{(robot.n, robot.m)}: robot_mpc makes such a problem"
         fail("mpc", f"has {sizes} states and inputs", f"This robot has {needed}")
     whole("sqp_steps", given.sqp_steps, 1)
+    if given.hessian not in ("exact", "gauss-newton"):
+        fail("hessian", f"{given.hessian!r}", 'Give "exact" or "gauss-newton"')
+    if given.hessian == "exact" and given.sqp_steps == 1:
+        fail("hessian", "'exact' with one quadratic program a sample", "Give sqp_steps=10")
     for name, there in (("tasks", len(given.tasks) > 0), ("sqp_steps", given.sqp_steps > 1)):
         if there and linearize != "trajectory":
             fail(name, f"given with linearize={linearize!r}", 'Give linearize="trajectory"')

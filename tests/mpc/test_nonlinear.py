@@ -364,3 +364,39 @@ def test_bad_arguments(name, x64):
     call, text = BAD[name]
     with pytest.raises(ValueError, match=text):
         call(around())
+
+
+def tip(at):
+    """The end of two links of 0.5 m in the plane."""
+    first, second = at.x[0], at.x[0] + at.x[1]
+    return 0.5 * jnp.stack([jnp.cos(first) + jnp.cos(second), jnp.sin(first) + jnp.sin(second)])
+
+
+def two_joints(x, u):
+    return jnp.concatenate([x[:2] + 0.05 * x[2:], x[2:] + 0.5 * u])
+
+
+@pytest.mark.slow
+def test_one_qp_a_sample_comes_to_rest_at_a_target_out_of_reach(x64):
+    """The arm ends stretched towards the target, 1.5 m away, where Gauss and Newton's full steps
+    swing from limit to limit."""
+    system = jm.LinearSystem(np.eye(4), np.zeros((4, 2)))
+    limits, slow = jm.Box([-1.0, -1.0], [1.0, 1.0]), [0, 0, 0.1, 0.1]
+    mpc = jm.MPC(
+        system, [1e-3, 1e-3, 0.1, 0.1], [1e-2, 1e-2], 15, inputs=limits, terminal_cost=slow
+    )
+    goal = 1.5 * np.array([np.cos(0.7), np.sin(0.7)])
+    problem = NonlinearMPC(mpc, two_joints, (Task(tip, weight=1e3, target=goal),))
+
+    def sample(carried, _):
+        x, last = carried
+        start = replace(last, states=last.states.at[0].set(x))
+        plan = solve_nonlinear(problem, x, warm_start=start, iterations=1)
+        return (two_joints(x, plan.inputs[0]), plan), (x, plan.inputs[0], plan.status)
+
+    x0 = jnp.array([0.2, 1.0, 0.0, 0.0])
+    first = solve_nonlinear(problem, x0, iterations=1)
+    x, u, status = jax.lax.scan(sample, (x0, first), length=120)[1]
+    assert (status == SOLVED).all()
+    np.testing.assert_allclose(u[-20:], 0.0, atol=1e-6)
+    np.testing.assert_allclose(x[-1], [0.7, 0, 0, 0], atol=1e-4)

@@ -2,8 +2,9 @@
 
 About a trajectory x (N+1, n), u (N, m) the problem becomes one of `stages.py`: the model affine,
 functions affine, the cost of weighed functions |g − target|²_W by Gauss and Newton: gradient
-2 G'W(g − target), Hessian 2 G'WG with G the Jacobian of g. All quadratic terms stand about the
-trajectory itself, so the gradient there is that of the true cost.
+2 G'W(g − target), Hessian 2 G'WG with G the Jacobian of g, and a diagonal that is at least the
+curvature left out (`majorant`). All quadratic terms stand about the trajectory itself, so the
+gradient there is that of the true cost.
 
 Near a solution, and for its derivatives, the Hessian of the Lagrangian takes the place of Gauss and
 Newton's, stage by stage: with the costates λ and the multipliers y of the functions' rows
@@ -333,6 +334,9 @@ def expanded(s: Stages, problem: NonlinearMPC, x: Array, u: Array) -> Stages:
             bent = spread(matmul(turned[0], WG), steps, N + 1)
             Q, P, R = Q + bent[:-1], P + bent[-1], R + spread(matmul(turned[1], WD), steps, N)
             cross = (0.0 if cross is None else cross) + spread(matmul(turned[1], WG), steps, N)
+            give, take = majorant(problem, task, at(x, steps), at(u, steps), error)
+            give = spread(give, steps, N + 1)
+            Q, P, R = Q + give[:-1], P + give[-1], R + spread(take, steps, N)
             gx = gx + spread(apply_transposed(G, error), steps, N + 1)
             gu = gu + spread(apply_transposed(D, error), steps, N)
         if task.limited:
@@ -353,6 +357,28 @@ def expanded(s: Stages, problem: NonlinearMPC, x: Array, u: Array) -> Stages:
         bounds=joined_bounds(bounds, dtype),
         aim=Aim(s.aim.x0, x, u, slopes=(gx, gu)),
     )
+
+
+def majorant(
+    problem: NonlinearMPC, task: Task, x: Array, u: Array, error: Array
+) -> tuple[Array, Array]:
+    """Return diagonal weights of states (steps, n, n) and inputs (steps, m, m) that are at least
+    the curvature which Gauss and Newton leave out, ½ Σ error_i ∇²g_i, error = 2 W (g − target).
+
+    A symmetric matrix is at most the diagonal of its absolute row sums. Where the target is met
+    they are zero. Where it is out of reach, full steps of Gauss and Newton alone may swing for
+    ever; with these weights the expansion bounds the task's cost from above, next to the
+    trajectory.
+    """
+    n = x.shape[-1]
+
+    def sums(x: Array, u: Array, error: Array) -> Array:
+        pulled = lambda z: jnp.sum(error * problem.value(task, z[:n], z[n:])) / 2
+        return jnp.sum(jnp.abs(jax.jacfwd(jax.grad(pulled))(jnp.concatenate([x, u]))), axis=1)
+
+    found = jax.lax.stop_gradient(jax.vmap(sums)(x, u, error))
+    diagonal = lambda v: v[:, :, None] * jnp.eye(v.shape[1], dtype=v.dtype)
+    return diagonal(found[:, :n]), diagonal(found[:, n:])
 
 
 def task_layout(problem: NonlinearMPC) -> tuple:

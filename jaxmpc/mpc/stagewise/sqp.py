@@ -102,7 +102,8 @@ def solve_nonlinear(
     iterations: QPs at most. 1: the real-time iteration, a full step, whose plan, residuals and
     status are those of the QP about the warm start.
     hessian: "exact", the Lagrangian's where it is convex (few QPs near the solution), or
-    "gauss-newton", which needs no second derivatives of the model. scale (rows,): row scale of a
+    "gauss-newton", which needs no second derivatives of the model (of tasks with weights, yes,
+    without which targets out of reach make full steps swing). scale (rows,): row scale of a
     similar problem, as in `solve_stagewise`.
 
     Returns the Plan at which the search ended, SOLVED where the residuals of the nonlinear problem
@@ -136,7 +137,9 @@ def solve_nonlinear(
     else:
         start = WarmStart.of(warm_start, rows, mpc)
     given = arrays((problem, solver, aim, start, scale))
-    return _solve(*given, iterations=int(iterations), hessian=hessian)
+    # About a plan the multipliers are known, of which the exact Hessian is made.
+    known = warm_start is not None
+    return _solve(*given, iterations=int(iterations), hessian=hessian, known=known)
 
 
 def _full_targets(
@@ -155,7 +158,7 @@ def _full_targets(
     return tuple(full)
 
 
-@partial(jax.jit, static_argnames=("iterations", "hessian"))
+@partial(jax.jit, static_argnames=("iterations", "hessian", "known"))
 @own_modes
 def _solve(
     problem: NonlinearMPC,
@@ -165,6 +168,7 @@ def _solve(
     scale: Array | None,
     iterations: int,
     hessian: str,
+    known: bool,
 ) -> Plan:
     base, fault = cleaned(Stages.of(problem.mpc))
     numbers = (aim, [(task.weight, task.rho) for task in problem.tasks])
@@ -181,7 +185,7 @@ def _solve(
     count = jnp.int32(1)
     if iterations > 1:
         constants = jax.lax.stop_gradient((base, problem, scale, eps))
-        first = Iterate.begin(*jax.lax.stop_gradient((x, u, y)))
+        first = Iterate.begin(*jax.lax.stop_gradient((x, u, y)), exact=known)
         step = partial(sqp_step, iterations, hessian)
         last = repeat_while(lambda state: state.open, step, constants, first, steps="recursion")
         x, u, y, count = last.x, last.u, last.y, last.steps
@@ -307,10 +311,10 @@ class Iterate:
     open: Array
 
     @classmethod
-    def begin(cls, x: Array, u: Array, y: Array) -> "Iterate":
+    def begin(cls, x: Array, u: Array, y: Array, exact: bool) -> "Iterate":
         """Return the state before the first QP."""
         merit = Merit(jnp.zeros_like(x[1:]), jnp.abs(y))
-        return cls(x, u, y, merit, jnp.int32(0), jnp.asarray(False), jnp.asarray(True))
+        return cls(x, u, y, merit, jnp.int32(0), jnp.asarray(exact), jnp.asarray(True))
 
 
 def costates(s: Stages, u: Array, y: Array) -> Array:
@@ -374,9 +378,10 @@ def sqp_step(most: int, hessian: str, constants: tuple, state: Iterate) -> Itera
     """Solve the QP about the iterate and go towards its solution; the search ends after `most` QPs,
     where the residuals are below a tenth of the tolerance, or where no step lowers the merit.
 
-    hessian="exact": after a full step the next QP has the Hessian of the Lagrangian, if that is
-    convex with the active rows held. It is then solved by Newton steps on the active rows alone,
-    and where that fails the step after takes Gauss and Newton's again.
+    hessian="exact": after a full step, and from the first QP on about a warm start, the QP has the
+    Hessian of the Lagrangian, if that is convex with the active rows held. It is then solved by
+    Newton steps on the active rows alone, and where that fails the step after takes Gauss and
+    Newton's again.
     """
     base, problem, scale, eps = constants
     x, u, y = state.x, state.u, state.y

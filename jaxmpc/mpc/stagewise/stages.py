@@ -309,6 +309,8 @@ def conditions(s: Stages, u: Array, y: Array) -> Optimality:
     far = absolute.aim._replace(states=-absolute.aim.states, inputs=-absolute.aim.inputs)
     weighed, own_terms = replace(absolute, aim=far).gradient(terms, jnp.abs(u))
     later = jax.lax.cumsum(weighed[1:], reverse=True)
+    # The rounding of a costate is that of others too, as of a speed's that of its position.
+    later = later + apply_transposed(absolute.A, later)
     back_terms = later + jnp.abs(of_cost) + jnp.abs(of_rows)
     cost_part = jnp.abs(own + apply_transposed(s.B, of_cost))
     row_part = jnp.abs(pushed + apply_transposed(s.B, of_rows))
