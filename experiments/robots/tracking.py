@@ -42,8 +42,8 @@ class Settings:
     """loops: robots of each task. seconds: of motion. modes: linearisations of the MPC. spread:
     of the starts, rad and (times 4) rad/s. speed: of the sinusoid, in velocity limits. velocity:
     limits in place of the file's, times theirs. margin: of `robot_mpc`. sqp: quadratic programs a
-    sample at most. hessian: of "sqp". masses: each body's mass is off by up to this share. noise: standard deviation
-    of measured positions (rad, m)."""
+    sample at most. hessian: of "sqp". masses: each body's mass is off by up to this share. noise:
+    standard deviation of measured positions (rad, m)."""
 
     robot: str = "arm2"
     loops: int = 32
