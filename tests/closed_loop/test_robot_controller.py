@@ -348,6 +348,8 @@ def test_bad_problems_and_controllers_are_named(pendulum, linear_mpc):
             r"mpc: has \(2, 1\) states and inputs. This robot has \(4, 2\): robot_mpc makes",
         ),
         (lambda: jm.RobotController(pendulum, mpc, solver, rho=-1.0), "rho"),
+        (lambda: jm.RobotController(pendulum, mpc, solver, hessian="bfgs"), "hessian: 'bfgs'"),
+        (lambda: jm.RobotController(pendulum, mpc, solver, hessian="exact"), "sqp_steps=10"),
         (lambda: jm.RobotController(pendulum, mpc, jm.ADMM(rho=[1.0, 2.0])), "rho: shape"),
         (lambda: follow([1.0, 2.0]), "K: shape .2,. where .1, 2. is needed"),
         (lambda: follow([[np.nan, 2.0]]), "K: holds NaN"),
