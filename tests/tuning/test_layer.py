@@ -39,25 +39,25 @@ def test_at_the_start_it_is_the_problem(layer, x64):
     for name, value in layer.values(theta).items():
         expected = {"Q": MPC.Q, "R": MPC.R, "A": A, "B": B, "inputs.upper": [0.5]}.get(name, 0.4)
         np.testing.assert_allclose(value, expected, rtol=1e-14, atol=1e-14)
-    x = np.array([[0.5, 0.2], [-0.9, 0.4]])
-    found = jax.jit(jax.vmap(layer, (None, 0)))(theta, x)
-    np.testing.assert_allclose(found.plan.inputs, jm.solve_many(MPC, x).inputs, atol=1e-9)
+    expected = jm.Controller(MPC).plan([0.5, 0.2]).inputs
+    np.testing.assert_allclose(layer(theta, [0.5, 0.2]).plan.inputs, expected, atol=1e-9)
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_derivatives_are_those_of_differences(layer, name, x64):
+def test_derivatives_are_those_of_differences(layer, x64):
     """Of a loss over states at which inputs, and soft rows, are at their limits."""
     x = jnp.array([[-0.7, -0.4], [0.85, 0.3], [0.2, 0.1], [0.55, 0.9]])
     theta = layer.init()
 
     @jax.jit
-    def loss(value):
-        return jnp.sum(jnp.sin(jax.vmap(layer, (None, 0))(theta | {name: value}, x).plan.inputs))
+    def loss(theta):
+        return jnp.sum(jnp.sin(jax.vmap(layer, (None, 0))(theta, x).plan.inputs))
 
-    start = np.asarray(theta[name])
-    expected = approx_fprime(start, lambda v: float(loss(jnp.asarray(v))), 1e-6)
-    scale = max(1.0, np.abs(expected).max())
-    np.testing.assert_allclose(jax.grad(loss)(theta[name]), expected, atol=2e-5 * scale)
+    gradient = jax.jit(jax.grad(loss))(theta)
+    for name in NAMES:
+        change = lambda v, name=name: float(loss(theta | {name: jnp.asarray(v)}))
+        expected = approx_fprime(np.asarray(theta[name]), change, 1e-6)
+        scale = max(1.0, np.abs(expected).max())
+        np.testing.assert_allclose(gradient[name], expected, atol=2e-5 * scale)
 
 
 def test_what_is_not_learned_is_fixed():
@@ -100,7 +100,6 @@ def test_a_closed_loop_carries_its_plans(layer):
 
     x = states(theta, jnp.array([0.8, 0.0]))
     assert np.abs(x[-1]).max() < 0.3 * np.abs(x[0]).max()
-    assert all(np.isfinite(v).all() for v in jax.jacobian(states)(theta, x[0]).values())
 
 
 @pytest.mark.parametrize(
