@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxmpc.arrays import Reals, host_array
+from jaxmpc.arrays import Reals, as_array, host_array
 from jaxmpc.checks import fail, whole
 from jaxmpc.closed_loop.simulation import simulate
 from jaxmpc.mpc.problem import MPC
@@ -76,7 +76,7 @@ def worst_disturbance(
         best = np.where(better[:, None, None], w, best)
         top = np.where(better, value, top)
         w = corners[np.argmax(slope @ corners.T, axis=2)]
-    return (best[0] if np.ndim(x0) == 1 else best), float(top.max())
+    return (best[0] if as_array(x0).ndim == 1 else best), float(top.max())
 
 
 def _signed(limits: Any, x: Array) -> Array:

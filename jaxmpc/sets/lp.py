@@ -31,6 +31,8 @@ HIGHS = {
     "small_matrix_value": 1e-12,
 }
 METHODS = "simplex", "ipm"
+# By how much an answer of HiGHS may violate scaled rows, well above its tolerance.
+KEPT = 1e-7
 # A set is flat if its rows keep no larger common margin, relative to its own size.
 FLAT = 1e-9
 # A sum within this of the sum of its terms' sizes is rounding: well above 2^-53, since the data are
@@ -81,6 +83,12 @@ class Program:
                 found = self._by_dual(cost)
             elif method != "none":
                 found, claim = self._model.maximise(cost, method)
+                if found is not None and self._excess(found[0]) > KEPT:
+                    # From the basis of another last column HiGHS may end at a point outside.
+                    self._model.forget()
+                    found, claim = self._model.maximise(cost, method)
+                    if found is not None and self._excess(found[0]) > KEPT:
+                        found = None
             if found is not None:
                 x, y = self._exact(cost, *found)
                 left = np.abs(self.M.T @ y - cost).max(initial=0.0)
@@ -96,6 +104,11 @@ class Program:
                 if self._ray(cost) is not None:
                     return Optimum(np.inf)
         fail("LP", "HiGHS finds no answer that can be checked", "Scale the rows to like size")
+
+    def _excess(self, x: np.ndarray) -> float:
+        """Return by how much x violates the scaled rows."""
+        slack = self.M @ x - self.b
+        return float(np.where(self.equal, np.abs(slack), slack).max(initial=0.0))
 
     def change_last_column(self, values: np.ndarray) -> None:
         """Put other values (rows,) in place of the last column of G. The next program begins at the
@@ -266,6 +279,11 @@ class Model:
         with self._alone:
             for i in range(rows):
                 self.highs.changeCoeff(i, n - 1, values[i])
+
+    def forget(self) -> None:
+        """Begin the next program anew, without a basis."""
+        with self._alone:
+            self.highs.clearSolver()
 
     def maximise(
         self, cost: np.ndarray, method: str = "simplex"

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from jaxmpc.sets import lp
+from jaxmpc.sets.lp import Model, Program
 
 
 def test_bound_is_valid_for_inexact_multipliers():
@@ -41,3 +42,35 @@ def test_small_entries_count_at_distant_points():
     rows = np.array([[1.0, 0.0], [-1.0, 0.0], [5e-10, 1.0], [0.0, -1.0]])
     sides = np.array([1000.0, 1.0, 1.0, 1e-7 - 1])
     assert lp.maximise(np.array([1.0, 0.0]), rows, sides).value == pytest.approx(200, rel=1e-6)
+
+
+def test_an_answer_outside_the_rows_is_asked_for_again(monkeypatch):
+    """HiGHS may call a point optimal that its rows exclude, after changes from an old basis."""
+    program, calls = Program(np.vstack([np.eye(2), -np.eye(2)]), np.ones(4)), []
+    maximise, forget = Model.maximise, Model.forget
+
+    def wrong_from_a_basis(model, cost, method="simplex"):
+        (x, y), claim = maximise(model, cost, method)
+        calls.append(method)
+        return (x + (0.01 if calls[-1] != "anew" and "anew" not in calls else 0.0), y), claim
+
+    monkeypatch.setattr(Model, "maximise", wrong_from_a_basis)
+    monkeypatch.setattr(Model, "forget", lambda model: (calls.append("anew"), forget(model)))
+    found = program.maximise(np.array([1.0, 2.0]))
+    assert calls == ["simplex", "anew", "simplex"]
+    np.testing.assert_allclose(found.x, [1, 1], atol=1e-12)
+    assert abs(found.value - 3) < 1e-12
+
+
+def test_no_answer_is_better_than_one_outside_the_rows(monkeypatch):
+    program = Program(np.vstack([np.eye(2), -np.eye(2)]), np.ones(4))
+    maximise = Model.maximise
+
+    def wrong(model, cost, method="simplex"):
+        (x, y), claim = maximise(model, cost, method)
+        return (x + 0.01, y), claim
+
+    monkeypatch.setattr(Model, "maximise", wrong)
+    monkeypatch.setattr(Program, "_by_dual", lambda *_: None)
+    with pytest.raises(ValueError, match="no answer that can be checked"):
+        program.maximise(np.array([1.0, 2.0]))
