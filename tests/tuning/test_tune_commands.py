@@ -331,3 +331,14 @@ def test_penalties_of_the_joint(tmp_path, capsys):
     assert after >= before
     config = load(tmp_path / "jaxmpc-solver" / "tuned.toml")
     jm.Controller(config.build_mpc(), config.build_solver())
+
+
+@pytest.mark.slow
+def test_the_first_example_gains_and_a_loss_of_the_controllers_own_says_so(tmp_path, capsys):
+    assert run(f"weights --updates 40 --output {tmp_path / 'a'}") == 0
+    capsys.readouterr()
+    found = json.loads((tmp_path / "a" / "tuning.json").read_text())["result"]
+    first, last = found["validation"]
+    assert last < 0.7 * first and found["after"]["at_target"] > found["before"]["at_target"]
+    assert run(f"weights --updates 0 --settling 0 --output {tmp_path / 'b'}") == 0
+    assert "little can be gained" in capsys.readouterr().out

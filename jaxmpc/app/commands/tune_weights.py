@@ -63,6 +63,9 @@ from jaxmpc.tuning.weights import SOLVER
 
 SPREAD = Values(lambda value: 0 < value <= 1, "Give a fraction above 0 and up to 1")
 FILES = ("tuning.json", TUNED, "tuning.png", "before_after.png", "maps.png")
+# Weight of the time to settle, in time steps, for a linear problem: without it the loss is about
+# the cost that the controller minimises anyway, and nothing can be gained.
+SETTLING = 5.0
 # Entries of a weight that the table shows.
 SHOWN = 24
 # Numbers of the table: name in `WeightTask.counts`, name in the table, what they are fractions of.
@@ -162,7 +165,7 @@ class TuneWeights:
     """Number of loops of each step, drawn again each time."""
     validation: Annotated[float, option("FRACTION", "0.25"), PART] = 0.25
     """Fraction of the initial states in the validation set."""
-    steps: Annotated[int | None, option("K", "50; robots: 1 s"), at_least(1)] = None
+    steps: Annotated[int | None, option("K", "100; robots: 1 s"), at_least(1)] = None
     """Length of the closed loops in time steps."""
     seconds: Annotated[float | None, option("S", "none: --steps"), POSITIVE] = None
     """Length of the closed loops in seconds."""
@@ -181,7 +184,7 @@ class TuneWeights:
     """Diagonal of the loss's own R."""
     violation: Annotated[float, option("W", "10"), NOT_NEGATIVE] = 10.0
     """Weight in the loss of violations of state limits, as fractions of half the range."""
-    settling: Annotated[float, option("W", "0"), NOT_NEGATIVE] = 0.0
+    settling: Annotated[float | None, option("W", "5; robots 0"), NOT_NEGATIVE] = None
     """Weight in the loss of the time to settle, for each time step."""
     tolerance: Annotated[float, option("FRACTION", "0.02"), POSITIVE] = 0.02
     """Distance that counts as at the target, as a fraction of half the range of each state."""
@@ -380,6 +383,8 @@ class WeightProblem:
 
 def problem_of_file(command: TuneWeights) -> WeightProblem:
     """Return the problem of a TOML file. Raises ValueError; compiles nothing."""
+    if command.settling is None:
+        command = dataclasses.replace(command, settling=SETTLING)
     overrides = given_options(command, "horizon", "terminal")
     config = with_margin(configs.load(command.config, overrides, "tune"), command)
     hard, rho = config.build_mpc(), config.cost.rho
@@ -390,7 +395,7 @@ def problem_of_file(command: TuneWeights) -> WeightProblem:
     solver = dataclasses.replace(
         config.build_solver() or SOLVER, **given_options(command, "iterations", "newton_steps")
     )
-    steps = number_of_steps(command, config.system.dt, 50)
+    steps = number_of_steps(command, config.system.dt, 100)
     require_sizes(command, steps, hard.system.n, hard.system.m)
     limits, spread = config.state_limits(), 0.9 if command.spread is None else command.spread
     parameters = weight_parameters(
@@ -605,6 +610,9 @@ def weight_rows(
         rows.append(("...", f"{len(entries) - SHOWN} more in {TUNED}"))
     if any(p.domain == "definite" for p in problem.task.parameters.values()):
         rows.append(("", f"of full matrices the diagonal; all of it in {TUNED}"))
+    own = isinstance(problem.task.plant, LinearPlant) and not problem.task.loss.settling
+    if own and _same_weights(problem.task):
+        rows.append(("loss", "about the cost that the controller minimises: little can be gained"))
     if not h.best:
         what = f"none of {h.steps} steps is better on the validation loops"
         rows.append(("result", f"{what}: {TUNED} is the start"))
@@ -614,6 +622,12 @@ def weight_rows(
     rejected = np.sum(~h.accepted)
     rows.append(("steps", f"best is {h.best} of {h.steps}; {rejected} rejected as not finite"))
     return [*rows, ("mode", run.settings["mode"])]
+
+
+def _same_weights(task: WeightTask) -> bool:
+    """Return whether the loss weighs states and inputs as the problem does before tuning."""
+    pairs = (task.loss.Q, task.mpc.Q), (task.loss.R, task.mpc.R)
+    return all(np.array_equal(np.asarray(a), np.asarray(b)) for a, b in pairs)
 
 
 def labelled(
