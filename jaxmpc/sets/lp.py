@@ -82,13 +82,7 @@ class Program:
             if method == "dual":
                 found = self._by_dual(cost)
             elif method != "none":
-                found, claim = self._model.maximise(cost, method)
-                if found is not None and self._excess(found[0]) > KEPT:
-                    # From the basis of another last column HiGHS may end at a point outside.
-                    self._model.forget()
-                    found, claim = self._model.maximise(cost, method)
-                    if found is not None and self._excess(found[0]) > KEPT:
-                        found = None
+                found, claim = self._answer(cost, method)
             if found is not None:
                 x, y = self._exact(cost, *found)
                 left = np.abs(self.M.T @ y - cost).max(initial=0.0)
@@ -105,10 +99,24 @@ class Program:
                     return Optimum(np.inf)
         fail("LP", "HiGHS finds no answer that can be checked", "Scale the rows to like size")
 
-    def _excess(self, x: np.ndarray) -> float:
-        """Return by how much x violates the scaled rows."""
-        slack = self.M @ x - self.b
-        return float(np.where(self.equal, np.abs(slack), slack).max(initial=0.0))
+    def _answer(
+        self, cost: np.ndarray, method: str
+    ) -> tuple[tuple[np.ndarray, np.ndarray] | None, bool]:
+        """Return what `Model.maximise` does. From the basis of another last column HiGHS may end at
+        a point outside the rows: then once more without a basis, and None if that is outside too.
+        """
+        claim = True
+        for _ in range(2):
+            found, claim = self._model.maximise(cost, method)
+            if found is None or self._excess(found[0], 0.0) <= KEPT:
+                return found, claim
+            self._model.forget()
+        return None, claim
+
+    def _excess(self, x: np.ndarray, least: float) -> float:
+        """Return by how much x violates the scaled rows, or `least` where that is more."""
+        excess = self.M @ x - self.b
+        return float(np.where(self.equal, np.abs(excess), excess).max(initial=least))
 
     def change_last_column(self, values: np.ndarray) -> None:
         """Put other values (rows,) in place of the last column of G. The next program begins at the
@@ -170,9 +178,7 @@ class Program:
             if found is not None:
                 x, y, count = found[0][:-1], found[1].copy(), len(self.b)
                 y[:count][self.equal] -= y[count:-1]
-                slack = self.M @ x - self.b
-                worst = np.where(self.equal, np.abs(slack), slack).max(initial=-1.0)
-                return x, y[:count], float(worst)
+                return x, y[:count], self._excess(x, -1.0)
         fail("LP", "HiGHS finds no point of least violation", "Scale the rows to like size")
 
     @cached_property
