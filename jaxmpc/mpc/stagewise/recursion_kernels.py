@@ -80,7 +80,6 @@ def riccati_recursion(Q: Array, R: Array, cross: Any, A: Array, B: Array) -> Gai
 def covariances(closed: Array, noise: Array) -> Array:
     """Σ (N, n, n) after each stage: Σ⁺ = C Σ C' + W from Σ = 0 with C, W (N, n, n) of the stage."""
     N, n, _ = closed.shape
-    length = math.isqrt(N - 1) + 1 if on_gpu() and N >= LONG else N
     moved = lambda C, S: matmul(C, matmul(S, jnp.swapaxes(C, -1, -2)))
 
     def stage(carry: tuple, at: tuple) -> tuple[tuple, tuple]:
@@ -91,12 +90,10 @@ def covariances(closed: Array, noise: Array) -> Array:
     def piece(C: Array, W: Array) -> tuple[Array, Array]:
         return jax.lax.scan(stage, (jnp.zeros_like(W[0]), jnp.eye(n, dtype=W.dtype)), (C, W))[1]
 
-    if length == N:
+    if not on_gpu() or N < LONG:
         return piece(closed, noise)[0]
     # Pieces side by side, then their starts one from the other, as in `_in_pieces`.
-    missing = -N % length
-    pieces = lambda v: jnp.pad(v, ((0, missing), (0, 0), (0, 0))).reshape(-1, length, n, n)
-    local, products = jax.vmap(piece)(pieces(closed), pieces(noise))
+    local, products = jax.vmap(piece)(_pieces(closed), _pieces(noise))
     advance = lambda S, end: (moved(end[1], S) + end[0], S)
     starts = jax.lax.scan(advance, jnp.zeros_like(noise[0]), (local[:, -1], products[:, -1]))[1]
     return (local + moved(products, starts[:, None])).reshape(-1, n, n)[:N]
@@ -226,14 +223,10 @@ def _recurrence_kernel(M: Array, w: Array, start: Array, *, adjoint: bool) -> Ar
 def _in_pieces(M: Array, w: Array, start: Array, *, adjoint: bool) -> Array:
     """The recurrence by pieces that run side by side."""
     N, n = w.shape
-    length = math.isqrt(N - 1) + 1
-    missing = -N % length
-    # Where the recurrence ends, so that what is added comes after it.
-    pieces = lambda v: jnp.pad(
-        v, [(missing, 0) if adjoint else (0, missing), *[(0, 0)] * (v.ndim - 1)]
-    ).reshape(-1, length, *v.shape[1:])
     own = None if M.ndim == 2 else 0
-    M, w = (M if own is None else pieces(M)), pieces(w)
+    # What is added stands where the recurrence ends, after all its stages.
+    M, w = (M if own is None else _pieces(M, at_front=adjoint)), _pieces(w, at_front=adjoint)
+    length = w.shape[1]
     run = partial(_recurrence_kernel, adjoint=adjoint)
     local = jax.vmap(run, in_axes=(own, 0, None))(M, w, jnp.zeros_like(start))
     columns = jax.vmap(run, in_axes=(None, None, 0), out_axes=2)
@@ -246,7 +239,15 @@ def _in_pieces(M: Array, w: Array, start: Array, *, adjoint: bool) -> Array:
     starts = [ends[1:], start[None]] if adjoint else [start[None], ends[:-1]]
     moved = jnp.einsum("pkij,pj->pki", products, jnp.concatenate(starts), precision="highest")
     y = (local + moved).reshape(-1, n)
-    return y[missing:] if adjoint else y[:N]
+    return y[-N:] if adjoint else y[:N]
+
+
+def _pieces(v: Array, *, at_front: bool = False) -> Array:
+    """Return v (N, …) in pieces of √N stages, filled up with zeros at the end or the front."""
+    length = math.isqrt(len(v) - 1) + 1
+    missing = -len(v) % length
+    stages = (missing, 0) if at_front else (0, missing)
+    return jnp.pad(v, [stages, *[(0, 0)] * (v.ndim - 1)]).reshape(-1, length, *v.shape[1:])
 
 
 def _tracking_kernel(
