@@ -93,8 +93,9 @@ class Hull:
         facets = facets[np.linalg.cond(edges_of(theta, facets) / unit[:, None]) < 1e8]
         M = np.linalg.inv(edges_of(theta, facets))
         free = len(problem.view.others) if problem.view.projects else 0
-        value = vertex_values(rays.data[0], rows, theta, w, free)
-        least, most = label_limits(rays.data[0], theta, value, facets, M)
+        exact, _ = rays.data
+        value = vertex_values(exact, rows, theta, w, free)
+        least, most = label_limits(exact, theta, value, facets, M)
         gauge, slope = M.sum(axis=1), edges_of(value, facets) @ M
         _, _, normals, offsets, cuts = proved
         return cls(center, M, gauge, least, most, value[-1], slope, normals, offsets, cuts, gap)

@@ -22,7 +22,14 @@ from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.plan import Control, Plan
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.admm import ADMM, DEFAULT
-from jaxmpc.tuning.parameters import Parameter, exact_values, raw, require_parameters, values
+from jaxmpc.tuning.parameters import (
+    Parameter,
+    exact_values,
+    is_diagonal,
+    raw,
+    require_parameters,
+    values,
+)
 
 # Short names of what lies in the system.
 SHORT = {"A": "system.A", "B": "system.B", "c": "system.c"}
@@ -75,8 +82,9 @@ class MPCLayer:
             if np.shape(parameter.value) != np.shape(parts[name]):
                 shape = np.shape(parameter.value)
                 fail(f"learn[{name!r}]", f"shape {shape}", f"Needed: {np.shape(parts[name])}")
+        mpc.validate()
+        solver.validate()
         self.mpc, self.solver, self.parameters = mpc, solver, found
-        Controller(mpc, solver)  # says what is wrong with the problem
 
     def __repr__(self) -> str:
         learned = ", ".join(f"{name} ({p.domain})" for name, p in self.parameters.items())
@@ -149,8 +157,7 @@ def _parameter(name: str, value: np.ndarray) -> Parameter:
     """Return the parameter that starts at the value, in the domain of its field."""
     field = _path(name)[-1]
     if field in MATRICES and value.ndim == 2:
-        diagonal = np.array_equal(value, np.diag(np.diag(value)))
-        return Parameter(value, "diagonal" if diagonal else "definite")
+        return Parameter(value, "diagonal" if is_diagonal(value) else "definite")
     return Parameter(value, "positive" if field in (*MATRICES, *POSITIVE) else "real")
 
 

@@ -56,7 +56,7 @@ class Parameter:
             if value.ndim != 2 or value.shape[0] != value.shape[1]:
                 fail("value", f"shape {value.shape}", "Give a square matrix")
             require_symmetric_psd("value", value, definite=True)
-            if self.domain == "diagonal" and np.any(value != np.diag(np.diag(value))):
+            if self.domain == "diagonal" and not is_diagonal(value):
                 fail("value", "is not diagonal", 'Use the domain "definite"')
         if self.domain == "positive" and not np.all(value > 0):
             fail("value", "holds an entry that is not positive", 'Use "real" or "interval"')
@@ -129,6 +129,11 @@ class Parameter:
 
 
 Parameters = Mapping[str, Parameter]
+
+
+def is_diagonal(M: np.ndarray) -> bool:
+    """Return whether a square matrix has no entry beside its diagonal."""
+    return bool(np.all(M == np.diag(np.diag(M))))
 
 
 def require_parameters(parameters: Parameters) -> None:

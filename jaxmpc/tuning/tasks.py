@@ -32,7 +32,7 @@ from jaxmpc.sets.limits import TOLERANCE, rows_kept
 from jaxmpc.sets.lp import Program
 from jaxmpc.systems.riccati import lqr
 from jaxmpc.tuning.losses import ClosedLoopLoss
-from jaxmpc.tuning.parameters import Parameter
+from jaxmpc.tuning.parameters import Parameter, is_diagonal
 from jaxmpc.tuning.result import TuningRun
 from jaxmpc.tuning.weights import SOLVER, tune_weights
 
@@ -151,7 +151,7 @@ def weight_parameters(
         if value is None:
             fail(f"tune {name}", "the problem has no terminal weight", 'Give [cost] P = "lqr"')
         value = np.asarray(value, float)
-        diagonal = bool(np.all(value == np.diag(np.diag(value))))
+        diagonal = is_diagonal(value)
         if weights == "diagonal" and not diagonal and name != "P":
             fail("weights", f"diagonal, and {name} of the problem is not", "Add --weights full")
         if np.linalg.eigvalsh((value + value.T) / 2)[0] <= 0:

@@ -49,6 +49,7 @@ from jaxmpc.qp.admm import ADMM
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.load import load_robot, model_hash
 from jaxmpc.sets.convex_sets import Ellipsoid, Polytope
+from jaxmpc.tuning.parameters import is_diagonal
 from jaxmpc.tuning.result import CHECKPOINT, TuningRun, run_folder
 from jaxmpc.tuning.tasks import (
     WeightTask,
@@ -576,7 +577,7 @@ def tuned(config: configs.Config, values: Mapping[str, np.ndarray]) -> configs.C
 def from_matrix(value: Any, flat: bool = True) -> Any:
     """Return a matrix as the file holds it: rows, or the diagonal of a diagonal one if `flat`."""
     value = np.asarray(value, float)
-    if flat and np.all(value == np.diag(np.diag(value))):
+    if flat and is_diagonal(value):
         return tuple(np.diag(value).tolist())
     return tuple(map(tuple, value.tolist()))
 
