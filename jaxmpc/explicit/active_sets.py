@@ -197,10 +197,14 @@ class LeastDistanceForm:
 
     def balance(self, rows: np.ndarray, total: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return Σ λ_i M_i = total over `rows`, which hold `total` in their span, as independent
-        equations in λ."""
+        equations in λ.
+
+        Rows have length 1 and the span is orthonormal, which bounds what is rounding. It must be
+        zero: λ_i = −1e-33 would have no λ ≥ 0."""
         span, size, _ = np.linalg.svd(self.M[rows].T, full_matrices=False)
         span = span[:, size > 1e-10 * size.max(initial=0.0)]
-        return span.T @ self.M[rows].T, span.T @ total
+        A, b = span.T @ self.M[rows].T, span.T @ total
+        return cleaned(A, 1.0), cleaned(b, np.linalg.norm(total))
 
     def active(self, xi: np.ndarray) -> tuple[int, ...] | None:
         """Return the active set of the perturbed problem at ξ; None where there is no solution."""

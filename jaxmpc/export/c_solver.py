@@ -144,6 +144,8 @@ def _tables(controller: Controller) -> dict[str, Any]:
     if c.balls:
         tables |= {"radius": bounds.radius, "ball_rows": np.array(c.balls)}
     tables |= input_limits(mpc)
+    if mpc.rate_limited:
+        tables |= {"last_theta": c.Psi[-1], "last_z": c.Omega[-1], "last_constant": c.psi[-1]}
     tables["later_move"] = np.array([mpc.moves[b + 1] if b + 1 < N else -1 for b in c.begins], int)
     tables["later_row"] = _later_rows(controller)
     return {key: np.asarray(value) for key, value in tables.items()}

@@ -129,8 +129,17 @@ static void warm_start(const NAME_memory *memory, const real *l, const real *u, 
         value = memory->z[later_move[k] * MU + i];
       } else { /* one step more: the unconstrained optimum, clipped */
         real own = 0;
+#if NAME_RATES
+        real last = last_constant[i];
+        for (int j = 0; j < NP; j++) last += last_theta[j * MU + i] * memory->theta[j];
+        for (int j = 0; j < NZ; j++) last += last_z[j * MU + i] * memory->z[j];
+#endif
         for (int j = 0; j < N; j++) value += tail_gain[j * MU + i] * x[j];
         for (int j = 0; j < N; j++) own += prestabilising_gain[j * MU + i] * x[j];
+#if NAME_RATES
+        real least = last + rate_lower[i], most = last + rate_upper[i];
+        value = value < least ? least : value > most ? most : value;
+#endif
         value = clipped(i, value) - own;
       }
       z[k * MU + i] = value;

@@ -6,7 +6,8 @@ The condensed QP is solved in other variables, whose terms can be far larger tha
 to: predictions of an unstable plant, limits less what the present state contributes. So what counts
 for the status of a plan is computed from A, B, c, the weights and the rows themselves:
 
-    rows       v = H x_k + D u_k beyond its bounds, relative to the larger of |bounds| and |v|;
+    rows       v = H x_k + D u_k beyond its bounds, relative to the larger of |bounds| and |v|, and
+               for bounds at 0 to a small share of what is typical of the row;
     dynamics   x_{k+1} − (A x_k + B u_k + c), relative to the largest value of the same state over
                the horizon, and a small share of what it is made of, |A||x_k| + |B||u_k| + |c|: a
                state that rests at 0 has no other size than that;
@@ -42,6 +43,7 @@ from jaxmpc.mpc.plan import (
     limited,
     require_warm_start,
     sorted_multipliers,
+    within_limits,
 )
 from jaxmpc.mpc.policy_rows import PolicyCondensed, condensed_plan
 from jaxmpc.mpc.problem import MPC, dynamics_of
@@ -165,12 +167,12 @@ class Controller:
         """The plan seen one time step later, as a warm start (`WarmStart.shifted`).
 
         The new last input is the unconstrained optimum of that step for the terminal cost about
-        the origin, clipped into its limits. With a control horizon each free input becomes what the
-        plan did one step after its beginning.
+        the origin, clipped into its limits and those of its rate. With a control horizon each free
+        input becomes what the plan did one step after its beginning.
         """
         c = self.condensed
         start = WarmStart.of(plan, c.layout, self.mpc)
-        tail = limited(self.mpc.inputs, matmul(c.K_N, start.states[-1]))
+        tail = within_limits(self.mpc, matmul(c.K_N, start.states[-1]), start.inputs[-1])
         return start.shifted(c.layout, tail, bool(c.balls))
 
     def plan(
@@ -396,7 +398,7 @@ def stated_terms(controller: Controller, y: Array, x: Array, u: Array, aim: Aim)
         gu = gu + _of_rates(push)
     gx, gu = 2 * gx, 2 * gu
 
-    violations, sizes = [], []
+    violations, values, limits = [], [], []
     gap = products = jnp.zeros((), x.dtype)
     for block, y_block in zip(blocks(mpc, x.dtype), split(c.layout, y), strict=True):
         if block.rate:
@@ -411,7 +413,8 @@ def stated_terms(controller: Controller, y: Array, x: Array, u: Array, aim: Aim)
         gap = gap + jnp.sum(penalty + support - y_rows * v)
         products = products + jnp.sum(jnp.abs(y_rows * v)) + jnp.sum(jnp.abs(support))
         violations.append(bounds.violation(v))
-        sizes.append(jnp.maximum(bounds.sizes(), jnp.abs(v)))
+        values.append(jnp.abs(v))
+        limits.append(bounds.sizes())
 
     moved = jnp.concatenate([M.reshape(-1, M.shape[-1]) for M in (c.Gamma, c.Omega)])
     g = matmul(jnp.concatenate([gx.ravel(), gu.ravel()]), moved)
@@ -424,7 +427,10 @@ def stated_terms(controller: Controller, y: Array, x: Array, u: Array, aim: Aim)
     terms = dynamics_terms(A, B, drift, x, u)
     most = jnp.max(jnp.abs(x), axis=0) + SHARE * jnp.max(terms, axis=0)
     most = jnp.broadcast_to(most, terms.shape)
-    row_size = jnp.concatenate([*sizes, y[:0]])
+    value, limit = (jnp.concatenate([*parts, y[:0]]) for parts in (values, limits))
+    row_size = jnp.maximum(limit, value)
+    # Only a limit of 0 has no size of its own.
+    unknown = jnp.where(limit > 0, 0.0, factor.row_norms)
     per_variable = 1 / jnp.sum(jnp.abs(factor.T), axis=1)
     # At a set-point tracking errors are zero, but not their rounding, which adds up over the steps
     # whose terms cancel, as where inputs balance the weight.
@@ -435,8 +441,8 @@ def stated_terms(controller: Controller, y: Array, x: Array, u: Array, aim: Aim)
     return [
         (
             jnp.concatenate([*violations, defects.ravel()]),
-            jnp.concatenate([row_size + SHARE * length * factor.row_norms, most.ravel()]),
-            jnp.concatenate([row_size + rounds * factor.row_norms, terms.ravel()]),
+            jnp.concatenate([row_size + SHARE * length * unknown, most.ravel()]),
+            jnp.concatenate([row_size + rounds * unknown, terms.ravel()]),
         ),
         (g, length * per_variable, rounds * per_variable + apart),
         (gap[None], 2 * J[None], (cancels + products)[None]),

@@ -85,7 +85,7 @@ def solve_many(
     x0s: Reals,
     solver: ADMM = DEFAULT,
     *,
-    dtype: DTypeLike = "float32",
+    dtype: DTypeLike | None = None,
     chunk: int | None = None,
     transfer: bool = True,
     to_host: bool = True,
@@ -97,11 +97,12 @@ def solve_many(
     last columns; (B, n) takes them as zero. The plans track the origin.
 
     mpc: the problem, or a Controller of it in float64, already condensed and factored, whose own
-    solver counts. dtype: type of the ADMM iterates; Newton steps, residuals, status and the answer
-    are float64 whatever it is, and whether or not 64-bit mode is on. chunk: states that a compiled
+    solver counts. dtype: type of the ADMM iterates; None: that of `solver`, by default float32
+    before Newton steps and float64 without any. Newton steps, residuals, status and the answer are
+    float64 whatever it is, and whether or not 64-bit mode is on. chunk: states that a compiled
     program takes at once; None: by device. transfer: on a CPU, of very many states with few
-    coordinates solve some, and let the others follow these (top of this file). The status of
-    each plan comes from its own residuals all the same: this changes the time, and which of several
+    coordinates solve some, and let the others follow these (top of this file). The status of each
+    plan comes from its own residuals all the same: this changes the time, and which of several
     plans within the tolerances is found.
     to_host: False leaves the plans on the device. devices: a number of them, or a sequence of JAX
     devices, which share the states of a chunk; None: the default device. A state with NaN gets
@@ -116,7 +117,9 @@ def solve_many(
         mpc.validate()
         problem = mpc
     require_kind("solver", solver, ADMM)
-    require_step_type(dtype)
+    if dtype is not None:
+        require_step_type(dtype)
+        solver = replace(solver, dtype=np.dtype(dtype).name)
     chosen = chosen_devices(devices)
     if chunk is not None:
         whole("chunk", chunk, 1)
@@ -129,7 +132,7 @@ def solve_many(
     require_memory("x0s", len(x0s) * each, "Solve some of them at a time")
     with jax.enable_x64(True):
         if not isinstance(mpc, Controller):
-            mpc = Controller(in_float64(mpc), replace(solver, dtype=np.dtype(dtype).name))
+            mpc = Controller(in_float64(mpc), solver)
         if x0s.shape[1] < p:
             x0s = np.pad(np.asarray(x0s), ((0, 0), (0, p - n)))
         some = x0s if len(x0s) else np.zeros((1, p))  # and none of the plans from these

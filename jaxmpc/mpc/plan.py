@@ -299,6 +299,14 @@ def rate_ends(mpc: MPC) -> tuple[Any, Any]:
     return (limit.lower, limit.upper) if isinstance(limit, Box) else (jnp.negative(limit), limit)
 
 
+def within_limits(mpc: MPC, u: Array, before: Array) -> Array:
+    """Return u (m,) clipped into the limits of its change from `before` (m,), if it has such, and
+    into the input limits."""
+    if mpc.rate_limited:
+        u = _between(u, *rate_ends(mpc), base=before)
+    return limited(mpc.inputs, u)
+
+
 def _between(u: Array, lower: Any, upper: Any, base: Any = 0) -> Array:
     """Return u clipped between base + lower and base + upper."""
     low, high = (jnp.asarray(v, u.dtype) for v in arrays((lower, upper)))
@@ -319,13 +327,11 @@ def applied(
     hold = jnp.zeros_like(u)
     if mpc.input_in_state and last is not None:
         hold = limited(mpc.inputs, jnp.where(jnp.isfinite(last), last, 0.0))
-    u = jnp.where(finite, u, hold)
-    if mpc.rate_limited:
-        u = _between(u, *rate_ends(mpc), base=hold)
+    u = within_limits(mpc, jnp.where(finite, u, hold), hold)
     new = WarmStart(plan.states, plan.inputs, flat_multipliers(layout, plan.multipliers))
     old = jax.tree.map(jnp.zeros_like, new) if before is None else before
     memory = jax.tree.map(partial(jnp.where, finite), new, old)
-    return Control(limited(mpc.inputs, u), plan, memory)
+    return Control(u, plan, memory)
 
 
 def cost(mpc: MPC, states: Array, inputs: Array, aim: Aim) -> Array:

@@ -43,7 +43,15 @@ from jaxmpc.qp.jax_transformations import (
     tree_where,
     varying,
 )
-from jaxmpc.qp.linalg import arrays, cast, floating_dtype, matmul, precisely, symmetric
+from jaxmpc.qp.linalg import (
+    arrays,
+    cast,
+    floating_dtype,
+    infinity_norm,
+    matmul,
+    precisely,
+    symmetric,
+)
 from jaxmpc.qp.newton import MultiplierState, improve, multipliers_start, multipliers_step
 from jaxmpc.qp.problem import QP, QPSolution
 from jaxmpc.qp.residuals import (
@@ -142,7 +150,10 @@ def search(
     begin = admm_end(p, solver, warm_start, refined=most > 0 and not unrolled)
     if most and not unrolled:
         return refined_end(p, solver, begin, whole)
-    return stepped_end(p, begin, most)
+    found = stepped_end(p, begin, most)
+    if most or not solver.admm_steps(warm_start is not None):
+        return found
+    return or_inaccurate(found, begin, solver.dtype or p.q.dtype)
 
 
 def admm_end(
@@ -215,6 +226,15 @@ def stepped_end(p: ScaledProgram, begin: MultiplierState, most: int) -> QPSoluti
     proof = certified(end.change, end.move).joined(certified(end.y, end.w))
     terms = lambda qp, sizes, z, y: residual_terms(qp, z, y, sizes)
     return assess(terms, (qp, sizes), *pair, proof, p.eps)
+
+
+def or_inaccurate(found: QPSolution, end: MultiplierState, dtype: DTypeLike) -> QPSolution:
+    """Return what ADMM alone has found, as INACCURATE where it is not solved and the last step
+    moved w and y by no more than the rounding of iterates of this type."""
+    eps, moves = jnp.finfo(dtype).eps, ((end.move, end.w), (end.change, end.y))
+    still = [infinity_norm(move) <= eps * infinity_norm(v) for move, v in moves]
+    stopped = (found.status == Status.ITERATION_LIMIT) & still[0] & still[1]
+    return replace(found, status=jnp.where(stopped, jnp.int32(Status.INACCURATE), found.status))
 
 
 def value(qp: QP, z: Array, y: Array) -> Array:

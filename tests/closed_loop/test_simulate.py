@@ -165,8 +165,9 @@ def test_soft_violation_is_reported():
     """A soft limit at 1: from x0 = 2 the violation is 1 at once, and 2 − 0.5 − 1 a step later."""
     rows = Soft(np.array([[1.0]]), upper=np.array([1.0]), rho=100.0)
     mpc = problems.scalar(horizon=2, x_max=None, u_max=0.5, soft=rows)
-    run = simulate(jm.Controller(mpc, CHEAP), mpc.system, np.array([2.0]), 3)
-    np.testing.assert_allclose(run.slack[:, 0], [1.0, 0.5, 0.0], atol=1e-4)
+    with jax.enable_x64(True):  # in float32 rounding of the penalty is beyond the tolerance
+        run = simulate(jm.Controller(mpc, CHEAP), mpc.system, np.array([2.0]), 3)
+    np.testing.assert_allclose(run.slack[:, 0], [1.0, 0.5, 0.0], atol=1e-6)
     assert run.feasible_steps == 3
 
 

@@ -113,6 +113,17 @@ class TestExactPenalty:
         assert found.rho_bar == pytest.approx(exact.rho_bar, rel=1e-3)
         assert found.rho_bar <= exact.rho_bar * (1 + 1e-9)
 
+    def test_touching_rows_without_multipliers(self):
+        """A vertex where rows touch that have no part in the balance: what rounding leaves of them
+        there, 1e-33, once had no multipliers."""
+        p = least_distance_form(problems.pair())
+        xi = p.scaled([-0.7914862914862912, -0.30851370851370874, -1.0, -0.0968931727780283])
+        found = p.solution(xi)
+        assert len(found.touching) > len(found.active)
+        for value in p.balance(found.touching, -found.y):
+            rounding = (value != 0) & (np.abs(value) < 1e-15)
+            assert not rounding.any()
+
     @pytest.mark.parametrize("mpc", [problems.lecture(), problems.drifting()],
                              ids=["lecture", "drifting"])  # fmt: skip
     def test_slack_starts_below(self, mpc):

@@ -86,6 +86,19 @@ def test_plans_are_those_of_other_solvers(seed):
     np.testing.assert_allclose(plan.inputs, u, atol=1e-5)
 
 
+def test_a_shifted_plan_ends_within_its_rate_limits():
+    """The optimum of one more step is far from the last input, beyond both kinds of limits."""
+    mpc, *_ = problem(0)
+    inputs, states = np.tile([0.9, -0.5], (N, 1)), np.full((N + 1, n), 4.0)
+    rows = np.zeros(len(jm.mpc.row_table(mpc)))
+    tails = [
+        jm.Controller(mpc).shifted(jm.mpc.WarmStart(sign * states, inputs, rows)).inputs[-1]
+        for sign in (1, -1)
+    ]
+    ends = np.array([[0.6, 1.0], [-0.7, -0.15]])  # -0.3, +0.25 but 1 at most; -0.2, +0.35
+    np.testing.assert_allclose(np.sort(tails, axis=0).T, ends)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("without", ["input_rate_limit", "input_rate_weight"])
 def test_limits_or_weights_alone(without):

@@ -208,6 +208,16 @@ def test_a_pair_near_the_solution_is_not_lost():
         assert best.or_better(other).error == best.error
 
 
+def test_steps_of_admm_that_move_nothing_are_inaccurate():
+    """In float32 the rounding of a multiplier of 2^16 is 2^-8: more steps, as ITERATION_LIMIT
+    advises, would be in vain."""
+    one = np.ones(1, np.float32)
+    qp = jm.QP(one[None], -1e5 * one / 3, one[None], -one, one / 3)
+    for steps, status in ((0, "ITERATION_LIMIT"), (200, "INACCURATE")):
+        solver = jm.ADMM(iterations=steps, newton_steps=0, eps=0.0)
+        assert jm.Status(int(jm.solve_qp(qp, solver).status)).name == status
+
+
 def test_solutions_say_what_their_status_means():
     q = np.ones((50, 2))
     q[7] = np.nan

@@ -241,8 +241,8 @@ def test_the_joint_is_solved_in_a_hundred_steps():
     assert solver.iterations == 100 and solver.newton_steps == 0
     assert solved(solver, x[3000:], problem) > 0.95
     assert solved(jm.ADMM(newton_steps=0), x[3000:], problem) < 0.1
-    many = jm.solve_many(problem, x[:500], solver)
-    assert np.all(many.status == jm.Status.SOLVED)
+    many = jm.solve_many(problem, x[3000:], solver)
+    assert np.mean(many.status == jm.Status.SOLVED) > 0.95
 
 
 @pytest.mark.slow
