@@ -59,10 +59,14 @@ def store_floats(instance: Any, *names: str) -> None:
             object.__setattr__(instance, name, value)
 
 
-def as_weight(value: Any, size: int) -> Any:
+def as_weight(value: Any, size: int, steps: int | None = None) -> Any:
     """Return a weight as a matrix where it has one meaning: a number for size 1, and a vector
-    (size,), which is a diagonal; anything else unchanged."""
+    (size,), which is a diagonal; of size 1 also a number for each of some steps, (steps,), which
+    is (steps, 1, 1). Anything else unchanged."""
     shape = np.shape(as_array(value)) if dimensions(value) in (0, 1) else None
+    if size == 1 and shape not in (None, (), (1,)) and shape == (steps,):
+        array = _array(value)
+        return array.reshape(-1, 1, 1) if array.dtype.kind in "fV" else value
     if (shape == () and size == 1) or shape == (size,):
         array = _array(value)
         if array.dtype.kind in "iufV":

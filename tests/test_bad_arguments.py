@@ -331,8 +331,8 @@ CALLS = [
         lambda: mpc(stage_weights=[1, 2]).validate(),
     ),
     (
-        "stage_weights: [0.0, 1.0, 1.0]. Give positive numbers",
-        lambda: mpc(stage_weights=[0, 1, 1]).validate(),
+        "stage_weights: [-1.0, 1.0, 1.0]. Give numbers of at least 0",
+        lambda: mpc(stage_weights=[-1, 1, 1]).validate(),
     ),
     ("stage_weights: 'www' where real numbers are", lambda: mpc(stage_weights="www").validate()),
     ("prestabilise: 'yes' where real numbers are", lambda: mpc(prestabilise="yes").validate()),

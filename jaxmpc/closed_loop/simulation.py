@@ -288,7 +288,9 @@ class Loop:
         self.observer: KalmanFilter | None = given.observer if own is None else own
         self.plant = plant = plant.given if isinstance(plant, ConstantModel) else plant
         self.horizon = controller.mpc.horizon
-        self.Q, self.R, *_ = weights_of(controller.mpc, dtype)
+        weights = weights_of(replace(controller.mpc, stage_weights=None), dtype)
+        # Where they differ from step to step a time step costs what the first of a plan does.
+        self.Q, self.R = (M[0] if M.ndim == 3 else M for M in (weights.Q, weights.R))
         # Steps by which plans begin later than what is measured.
         self.later = given.delay if given.compensate else 0
         # ξ of a state and the state of ξ, where the plant tells them apart.

@@ -238,8 +238,9 @@ def cost_of_parameters(
     def track(M: np.ndarray, target: np.ndarray) -> np.ndarray:
         return np.concatenate([M, np.broadcast_to(-target, (*M.shape[:2], k))], axis=2)
 
-    stage = np.asarray(c.weights.stage)[:, None, None]
-    Q, R = stage * np.asarray(c.weights.Q), stage * np.asarray(c.weights.R)
+    Q, R = (
+        np.broadcast_to(M, (N, *M.shape[-2:])) for M in map(np.asarray, (c.weights.Q, c.weights.R))
+    )
     states = np.concatenate([Q, np.asarray(c.weights.P)[None]])
     terms = [
         (states, np.asarray(c.Gamma), track(np.asarray(c.Phi), of_states), np.asarray(c.phi)),

@@ -5,6 +5,8 @@ are affine in z and in the parameter θ = x_0, or θ = (x_0, u_{−1}) where inp
 
     x_k = Φ_k θ + Γ_k z + φ_k,        u_k = K x_k + v_k = Ψ_k θ + Ω_k z + ψ_k.
 
+Γ, Φ and φ side by side follow from step to step by one recursion, X⁺ = (A + BK) X + [B E_k, 0, c],
+with E_k the columns of the input of step k; A, B, c and K may differ from step to step.
 With a control horizon z holds the free moves only. Every constraint is then a row
 lower ≤ C z + D θ + d ≤ upper, in the order of `rows.blocks`; the cost is
 ½ z'Pz + (F θ + f(references))'z + const. P, F, C, D depend on nothing that changes from one time
@@ -24,6 +26,7 @@ from jaxmpc.arrays import host_array
 from jaxmpc.checks import concrete, require_memory
 from jaxmpc.mpc.problem import MPC, Switch, Weights, dynamics_of, weights_of
 from jaxmpc.mpc.rows import Layout, blocks, bounds_of, layout_of, split, stacked
+from jaxmpc.mpc.stagewise.recursion_kernels import riccati_recursion
 from jaxmpc.mpc.tightening import require_room, require_tightened, with_gain
 from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.jax_transformations import (
@@ -32,7 +35,7 @@ from jaxmpc.qp.jax_transformations import (
     own_modes,
     varying,
 )
-from jaxmpc.qp.linalg import arrays, floating_dtype, matmul, solve
+from jaxmpc.qp.linalg import apply, arrays, by_step, floating_dtype, matmul, solve
 from jaxmpc.qp.problem import QP, Bounds
 from jaxmpc.systems.riccati import lqr
 from jaxmpc.systems.system import LinearSystem, host_matrices
@@ -47,9 +50,9 @@ class Condensed:
     predicted inputs. P (nz, nz), F (nz, p), f (nz,): cost. C, D, d, lower, upper: rows.
     soft_linear, soft_quadratic (rows,): weights of soft rows, inf and 0 where hard; None without
     any. radius: of the terminal ball, whose rows are the last `balls`. weights: of the cost.
-    K (m, n): prestabilising gain. K_N (m, n): gain of the unconstrained input of one more step,
-    u_N = K_N x_N. layout: (kind, steps, rows a step) of each block of rows. begins: the first step
-    of each move.
+    K (m, n), or one a step: prestabilising gain. K_N (m, n): gain of the unconstrained input of one
+    more step, u_N = K_N x_N. layout: (kind, steps, rows a step) of each block of rows. begins: the
+    first step of each move.
     """
 
     Phi: Array
@@ -117,7 +120,7 @@ class Condensed:
     def variables(self, states: Array, inputs: Array) -> Array:
         """z (nz,) of a trajectory, states (N+1, n) and inputs (N, m): the inverse of
         `trajectory`, with the input at its first step for each move."""
-        return (inputs - matmul(states[:-1], self.K.T))[np.array(self.begins)].ravel()
+        return (inputs - apply(self.K, states[:-1]))[np.array(self.begins)].ravel()
 
     def trajectory(self, theta: Array, z: Array) -> tuple[Array, Array]:
         """States (N+1, n) and inputs (N, m) that z predicts from θ."""
@@ -131,15 +134,27 @@ class Condensed:
         """States (N+1, n) and inputs (N, m) that a forecast e (N, n) adds to those of z and θ:
         x̃_{k+1} = (A + BK) x̃_k + e_k from x̃_0 = 0, ũ_k = K x̃_k."""
         A, B, _ = dynamics_of(system, forecast.dtype)
-        closed = A + matmul(B, self.K)
-        move = lambda x, e: (matmul(closed, x) + e, x)
-        last, states = jax.lax.scan(move, jnp.zeros_like(forecast[0]), forecast)
-        return jnp.concatenate([states, last[None]]), matmul(states, self.K.T)
+        states = _predicted(A + matmul(B, self.K), forecast, jnp.zeros_like(forecast[0]))
+        return states, apply(self.K, states[:-1])
+
+
+def _predicted(A: Array, w: Array, start: Array) -> Array:
+    """Return x_0 … x_N of x⁺ = A_k x + w_k from x_0 = start, a vector or a matrix: A (n, n), or
+    one a step, w (N, n, …)."""
+    each, at = by_step((A, 2))
+
+    def move(x: Array, step: tuple) -> tuple[Array, Array]:
+        own, w = step
+        return matmul(at(own)[0], x) + w, x
+
+    last, x = jax.lax.scan(move, varying(start, (A, w)), (each, w))
+    return jnp.concatenate([x, last[None]])
 
 
 def prestabilising_gain(mpc: MPC) -> Any:
-    """Return the gain K (m, n) of u = Kx + v that `mpc.prestabilise` asks for, zero for none.
-    Raises ValueError where it is True and there is no LQR; none if A and B are traced then."""
+    """Return the gain K (m, n) of u = Kx + v that `mpc.prestabilise` asks for, zero for none; one
+    for each step, (N, m, n), where the system differs from step to step. Raises ValueError where it
+    is True and there is no LQR; none if A and B are traced then."""
     wish, none = mpc.prestabilise, np.zeros((mpc.system.m, mpc.system.n))
     if not isinstance(wish, Switch | None):
         return wish
@@ -147,6 +162,8 @@ def prestabilising_gain(mpc: MPC) -> Any:
         return none
     # Any stabilising gain serves; a little weight on every state makes the DARE solvable.
     Q, R = np.eye(mpc.system.n), np.eye(mpc.system.m)
+    if {"system.A", "system.B"} & set(mpc.varying):
+        return _gains_by_step(mpc)
     if not concrete(mpc.system.A, mpc.system.B):
         if wish is None:
             return none
@@ -155,7 +172,7 @@ def prestabilising_gain(mpc: MPC) -> Any:
     A, B, _ = host_matrices(mpc.system)
     if wish is None and np.abs(np.linalg.eigvals(A)).max() <= 1 + 1e-9:
         return none
-    if concrete(mpc.Q, mpc.R):
+    if concrete(mpc.Q, mpc.R) and np.ndim(mpc.Q) == np.ndim(mpc.R) == 2:
         Q, R = host_array("Q", mpc.Q), host_array("R", mpc.R)
     Q = Q + 1e-3 * max(np.trace(Q) / len(Q), 1e-9) * np.eye(len(Q))
     if np.linalg.eigvalsh((R + R.T) / 2)[0] <= 0:
@@ -168,10 +185,33 @@ def prestabilising_gain(mpc: MPC) -> Any:
         raise
 
 
+def _gains_by_step(mpc: MPC) -> Any:
+    """Return the gains (N, m, n) of the regulator of unit weights over the horizon, for a system
+    that differs from step to step; (m, n) zeros where no step grows and none was asked for."""
+    n, m, N = mpc.system.n, mpc.system.m, mpc.horizon
+    A, B = mpc.system.A, mpc.system.B
+    if mpc.prestabilise is None:
+        if not concrete(A, B):
+            return np.zeros((m, n))
+        A, B, _ = host_matrices(mpc.system, by_step=True)
+        if np.abs(np.linalg.eigvals(A)).max() <= 1 + 1e-9:
+            return np.zeros((m, n))
+    dtype = floating_dtype((A, B))
+    A, B = (jnp.asarray(v, dtype) for v in jax.lax.stop_gradient((A, B)))
+    Q, R = (jnp.broadcast_to(jnp.eye(k, dtype=dtype), (N + 1, k, k)) for k in (n, m))
+    return _regulator(Q, R[:-1], A, B)
+
+
+@compiled_lightly(0)
+@own_modes
+def _regulator(Q: Array, R: Array, A: Array, B: Array) -> Array:
+    return riccati_recursion(Q, R, None, A, B).K
+
+
 def condense(mpc: MPC) -> Condensed:
     """Build the parametric QP. Differentiable in every array of `mpc`. Raises ValueError where it
     does not fit into memory."""
-    a_step = sum(np.shape(s.rows()[1])[0] for s in (mpc.states, mpc.inputs) if s is not None)
+    a_step = sum(np.shape(s.rows()[1])[-1] for s in (mpc.states, mpc.inputs) if s is not None)
     sizes = mpc.horizon, mpc.system.n, mpc.system.m, mpc.control_horizon, a_step
     needed = condensed_bytes(*sizes) * jax.dtypes.canonicalize_dtype(float).itemsize / 8
     require_memory("horizon", needed, "Give fewer steps, or use jm.mpc.solve_stagewise")
@@ -209,27 +249,22 @@ def _condense(mpc: MPC) -> Condensed:
     n, m, p = system.n, system.m, mpc.dimension
     dtype = floating_dtype(replace(mpc, prestabilise=None))
     cast = lambda v: jnp.asarray(v, dtype)
-    weights = Q, R, P_N, W, stage = weights_of(mpc, dtype)
+    weights = Q, R, P_N, W = weights_of(mpc, dtype)
     A, B, c = dynamics_of(system, dtype)
     K = cast(mpc.prestabilise)
 
-    A_K = A + matmul(B, K)
-    _, powers = jax.lax.scan(
-        lambda M, _: (matmul(A_K, M), M), varying(jnp.eye(n, dtype=dtype), A_K), length=N + 1
+    # v_k = E_k z: the steps of a block share their move.
+    places = np.eye(max(mpc.moves) + 1)[list(mpc.moves)]
+    E = cast(np.kron(places, np.eye(m)).reshape(N, m, -1))
+    nz = E.shape[2]
+    pushes = cast(places)[:, None, :, None] * B[..., None, :]
+    drift = jnp.broadcast_to(c, (N, n))[..., None]
+    w = [pushes.reshape(N, n, nz), jnp.zeros((N, n, p), dtype), drift]
+    X = _predicted(
+        A + matmul(B, K), jnp.concatenate(w, axis=2), jnp.eye(n, nz + p + 1, nz, dtype=dtype)
     )
-    response = matmul(powers[:N], B)  # A_K^j B
-    lag = np.arange(N + 1)[:, None] - 1 - np.arange(N)[None, :]
-    Gamma = jnp.where((lag >= 0)[:, :, None, None], response[np.maximum(lag, 0)], 0.0)
-    Gamma = Gamma.transpose(0, 2, 1, 3).reshape(N + 1, n, N * m)
-    drift = matmul(powers[:N], c)  # A_K^j c
-    phi = jnp.concatenate([jnp.zeros((1, n), dtype), jnp.cumsum(drift, axis=0)])
-    Phi = jnp.pad(powers, ((0, 0), (0, 0), (0, p - n)))
-
-    own = jnp.eye(N * m, dtype=dtype).reshape(N, m, N * m)
-    Psi, Omega, psi = matmul(K, Phi[:N]), matmul(K, Gamma[:N]) + own, matmul(phi[:N], K.T)
-    if mpc.control_horizon is not None:  # v = E z: the steps of a block share their move
-        E = np.kron(np.eye(max(mpc.moves) + 1)[list(mpc.moves)], np.eye(m))
-        Gamma, Omega = matmul(Gamma, cast(E)), matmul(Omega, cast(E))
+    Gamma, Phi, phi = X[..., :nz], X[..., nz:-1], X[..., -1]
+    Psi, Omega, psi = matmul(K, Phi[:N]), matmul(K, Gamma[:N]) + E, apply(K, phi[:N])
 
     # Δu_k = u_k − u_{k−1}, with u_{−1} the last m coordinates of θ.
     previous = jnp.pad(jnp.eye(m, dtype=dtype), ((0, 0), (n, 0))) if p > n else jnp.zeros((m, p))
@@ -239,26 +274,27 @@ def _condense(mpc: MPC) -> Condensed:
         for M, M_0 in zip((Omega, Psi, psi), before, strict=True)
     )
 
-    of_states = jnp.concatenate([stage[:, None, None] * Q, P_N[None]])
-    of_inputs = R if mpc.stage_weights is None else stage[:, None, None] * R
+    of_states = jnp.concatenate([jnp.broadcast_to(Q, (N, n, n)), P_N[None]])
     product = lambda M, weight, X: jnp.einsum(
         f"kai,{'kab' if weight.ndim == 3 else 'ab'},kb...->i...", M, weight, X, precision="highest"
     )
     # 2 Σ_k M_k' W_k X_k with the weights of states, inputs and rates: the Hessian for X = Γ, the
     # part of the linear term in θ for X = Φ, its constant part for X = φ.
     form = lambda X, U, V: (
-        2 * (product(Gamma, of_states, X) + product(Omega, of_inputs, U) + product(rates[0], W, V))
+        2 * (product(Gamma, of_states, X) + product(Omega, R, U) + product(rates[0], W, V))
     )
     if mpc.input_rate_weight is None:
-        form = lambda X, U, V: 2 * (product(Gamma, of_states, X) + product(Omega, of_inputs, U))
+        form = lambda X, U, V: 2 * (product(Gamma, of_states, X) + product(Omega, R, U))
     P = form(Gamma, Omega, rates[0])
 
-    # argmin over u of u'Ru + (Ax + Bu)'P(Ax + Bu), the least of them where there are several.
-    BtP = matmul(B.T, P_N)
-    G = R + matmul(BtP, B)
+    # argmin over u of u'Ru + (Ax + Bu)'P(Ax + Bu) with the data of the last step, the least of
+    # them where there are several.
+    A_last, B_last, R_last = (M[-1] if M.ndim == 3 else M for M in (A, B, R))
+    BtP = matmul(B_last.T, P_N)
+    G = R_last + matmul(BtP, B_last)
     ridge = 10 * jnp.finfo(dtype).eps * jnp.trace(G) / m
     ridge = jnp.where(ridge > 0, ridge, 1.0)
-    K_N = -solve(G + ridge * jnp.eye(m, dtype=dtype), matmul(BtP, A))
+    K_N = -solve(G + ridge * jnp.eye(m, dtype=dtype), matmul(BtP, A_last))
 
     found = blocks(mpc, dtype)
     bounds = bounds_of(found, dtype)

@@ -47,13 +47,13 @@ from jaxmpc.mpc.plan import (
 )
 from jaxmpc.mpc.policy_rows import PolicyCondensed, condensed_plan
 from jaxmpc.mpc.problem import MPC, dynamics_of
-from jaxmpc.mpc.rows import apply, blocks, dynamics_terms, given_blocks, split
+from jaxmpc.mpc.rows import blocks, dynamics_terms, given_blocks, split
 from jaxmpc.mpc.tightening import with_gain
 from jaxmpc.pytrees import prepared_pytree
 from jaxmpc.qp.admm import ADMM, DEFAULT, Factor, factorise
 from jaxmpc.qp.dual import has_dual_steps
 from jaxmpc.qp.jax_transformations import compiled_lightly, own_modes, varying
-from jaxmpc.qp.linalg import arrays, matmul, rounding
+from jaxmpc.qp.linalg import apply, arrays, matmul, rounding
 from jaxmpc.qp.problem import QP, QPSolution
 from jaxmpc.qp.residuals import SHARE, Measured, Terms, worst
 from jaxmpc.qp.solve import in_two_parts, solve_factored
@@ -334,7 +334,7 @@ def _qp(controller: Controller, theta: Array, aim: Aim) -> QP:
     qp = c.qp(theta, states - x, inputs - u, shift)
     if mpc.input_rate_weight is None:
         return qp
-    push = _of_rates(2 * matmul(rates, c.weights.W))
+    push = _of_rates(2 * apply(c.weights.W, rates))
     return replace(qp, q=qp.q + jnp.einsum("kmi,km->i", c.Omega, push, precision="highest"))
 
 
@@ -393,7 +393,7 @@ def stated_terms(controller: Controller, y: Array, x: Array, u: Array, aim: Aim)
     before = jnp.zeros_like(u[0]) if aim.previous_input is None else aim.previous_input
     rates = jnp.diff(u, axis=0, prepend=before[None])
     if mpc.input_rate_weight is not None:
-        push = matmul(rates, weights.W)
+        push = apply(weights.W, rates)
         J = J + jnp.sum(rates * push)
         gu = gu + _of_rates(push)
     gx, gu = 2 * gx, 2 * gu

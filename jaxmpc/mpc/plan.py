@@ -17,7 +17,7 @@ from jaxmpc.checks import fail
 from jaxmpc.mpc.problem import MPC, weights_of
 from jaxmpc.mpc.rows import Block, Layout, blocks, given_blocks, layout, row_count, row_table, split
 from jaxmpc.pytrees import named_pytree, pytree
-from jaxmpc.qp.linalg import arrays, matmul
+from jaxmpc.qp.linalg import apply, arrays
 from jaxmpc.qp.problem import QPSolution
 from jaxmpc.qp.residuals import with_fault
 from jaxmpc.qp.status import Status, WithStatus
@@ -339,10 +339,9 @@ def cost(mpc: MPC, states: Array, inputs: Array, aim: Aim) -> Array:
     rates and soft rows add."""
     error = states if aim.states is None else states - aim.states
     effort = inputs if aim.inputs is None else inputs - aim.inputs
-    square = lambda v, W, s=1.0: jnp.sum(s * v * matmul(v, W))
+    square = lambda v, W: jnp.sum(v * apply(W, v))
     weights = weights_of(mpc, states.dtype)
-    stage = 1.0 if mpc.stage_weights is None else weights.stage[:, None]
-    J = square(error[:-1], weights.Q, stage) + square(effort, weights.R, stage)
+    J = square(error[:-1], weights.Q) + square(effort, weights.R)
     if mpc.terminal_cost is not None:
         J = J + square(error[-1:], weights.P)
     if mpc.input_rate_weight is not None:

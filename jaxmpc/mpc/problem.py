@@ -28,7 +28,7 @@ from jaxmpc.checks import (
     require_symmetric_psd,
 )
 from jaxmpc.pytrees import named_pytree, pytree, static, static_pytree
-from jaxmpc.qp.linalg import matmul, symmetric
+from jaxmpc.qp.linalg import apply, matmul, symmetric
 from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope
 from jaxmpc.sets.disturbances import require_disturbance
 from jaxmpc.sets.limits import output_limits
@@ -116,22 +116,21 @@ class Soft(TwoSided):
 @named_pytree
 class Weights(NamedTuple):
     """The weights of a cost as symmetric matrices of one floating type: Q (n, n), R (m, m),
-    P (n, n) of x_N and W (m, m) of input rates, zero for None, and stage (N,)."""
+    P (n, n) of x_N and W (m, m) of input rates, zero for None. Q, R and W may have a leading axis
+    N; Q and R are then, and with weights of the stages, those of each step."""
 
     Q: Array
     R: Array
     P: Array
     W: Array
-    stage: Array
 
     def of_states(self, x: Array) -> Array:
-        """Return s_k Q x_k and P x_N (N+1, n): half the gradient of the cost."""
-        stages = self.stage[:, None] * matmul(x[:-1], self.Q)
-        return jnp.concatenate([stages, matmul(x[-1:], self.P)])
+        """Return Q_k x_k and P x_N (N+1, n): half the gradient of the cost."""
+        return jnp.concatenate([apply(self.Q, x[:-1]), matmul(x[-1:], self.P)])
 
     def of_inputs(self, u: Array) -> Array:
-        """Return s_k R u_k (N, m)."""
-        return self.stage[:, None] * matmul(u, self.R)
+        """Return R_k u_k (N, m)."""
+        return apply(self.R, u)
 
 
 @static_pytree
@@ -156,9 +155,11 @@ class MPC:
              u_k ∈ inputs (k = 0..N−1),  x_N ∈ terminal_set.
 
     Arguments:
-        system: LinearSystem with n states and m inputs.
-        Q: (n, n) ⪰ 0, or its diagonal (n,), or a number for one state.
-        R: (m, m) ⪰ 0, or its diagonal (m,), or a number for one input.
+        system: LinearSystem with n states and m inputs. A (N, n, n), B (N, n, m) and c (N, n), or
+            some of them, make it another one at each step: x_{k+1} = A_k x_k + B_k u_k + c_k.
+        Q: (n, n) ⪰ 0, or its diagonal (n,), or a number for one state; or one for each step,
+            (N, n, n).
+        R: (m, m) ⪰ 0, or its diagonal (m,), or a number for one input; or (N, m, m).
         horizon: N ≥ 1.
         states: Box or Polytope in the units of x; None: no limits.
         inputs: Box or Polytope in the units of u; None: no limits.
@@ -175,13 +176,13 @@ class MPC:
         constrained_stages: the k in 0..N at which `states` hold, where that is another index set.
         control_horizon: number of free moves m ≤ N, u_k = u_{m−1} from k = m − 1 on, or a tuple of
             block lengths that add up to N (move blocking).
-        input_rate_weight: W (m, m) or its diagonal (m,), or a number for one input: adds
-            Σ Δu_k'W Δu_k with Δu_k = u_k − u_{k−1}.
+        input_rate_weight: W (m, m) or its diagonal (m,), or a number for one input, or (N, m, m):
+            adds Σ Δu_k'W Δu_k with Δu_k = u_k − u_{k−1}.
         input_rate_limit: |Δu_k| ≤ limit, (m,) or a number, or Δu_k in a Box; in the units of u for
             each time step. With it, or a weight of rates, the previous input u_{−1} is part of the
             state of the controller: `solve(..., previous_input=)`; in sweeps the states are
             (x, u_{−1}), n + m in all, if there is a limit.
-        stage_weights: s (N,) > 0 weighs the stages, Σ s_k (x_k'Q x_k + u_k'R u_k); None: all 1.
+        stage_weights: s (N,) ≥ 0 weighs the stages, Σ s_k (x_k'Q x_k + u_k'R u_k); None: all 1.
         disturbance: W, a bounded Box, Polytope or Zonotope that holds the origin: the plant is
             x⁺ = A x + B u + c + E w, and all rows, the terminal set and soft rows too, are kept for
             every w_k ∈ W.
@@ -237,12 +238,12 @@ class MPC:
         system = self.system
         if not isinstance(system, LinearSystem):
             return
-        # (Three where the system differs from step to step: `solve_stagewise`.)
         if not {dimensions(system.A), dimensions(system.B)} <= {2, 3}:
             return
         n, m = system.n, system.m
         for name, size in (("Q", n), ("R", m), ("terminal_cost", n), ("input_rate_weight", m)):
-            object.__setattr__(self, name, as_weight(getattr(self, name), size))
+            steps = None if name == "terminal_cost" else self.horizon
+            object.__setattr__(self, name, as_weight(getattr(self, name), size, steps))
         sets = {"states": n, "inputs": m, "terminal_set": n, "disturbance": self.disturbances}
         for name, size in sets.items():
             if isinstance(getattr(self, name), Box):
@@ -307,18 +308,16 @@ class MPC:
         """Raise ValueError that names the field, its value and the cure, before any compile."""
         self.require_sizes()
         n, m = self.system.n, self.system.m
-        require_shape("Q", self.Q, (n, n), "Q weighs the states: one row for each")
-        require_shape("R", self.R, (m, m), "R weighs the inputs: one row for each")
-        require_symmetric_psd("Q", self.Q)
-        require_symmetric_psd("R", self.R)
+        self._require_weight("Q", n, "Q weighs the states: one row for each")
+        self._require_weight("R", m, "R weighs the inputs: one row for each")
         if self.terminal_cost is not None:
             require_shape("terminal_cost", self.terminal_cost, (n, n), "P weighs the last state")
             require_symmetric_psd("terminal_cost", self.terminal_cost)
         if self.stage_weights is not None:
             s, N = self.stage_weights, self.horizon
             require_shape("stage_weights", s, (N,), "One number for each k = 0..N−1")
-            if concrete(s) and not (np.all(np.isfinite(s)) and np.all(np.asarray(s) > 0)):
-                fail("stage_weights", f"{np.asarray(s).tolist()}", "Give positive numbers")
+            if concrete(s) and not (np.all(np.isfinite(s)) and np.all(np.asarray(s) >= 0)):
+                fail("stage_weights", f"{np.asarray(s).tolist()}", "Give numbers of at least 0")
         for name, kinds, size in (
             ("states", (Box, Polytope), n),
             ("inputs", (Box, Polytope), m),
@@ -334,7 +333,9 @@ class MPC:
             if isinstance(value, Ellipsoid):
                 value.require_origin(name)
         if not isinstance(self.prestabilise, Switch | None):
-            require_shape("prestabilise", self.prestabilise, (m, n), "A gain K with u = Kx + v")
+            K = self.prestabilise
+            if np.shape(K) != (self.horizon, m, n):
+                require_shape("prestabilise", K, (m, n), "A gain K with u = Kx + v, or N of them")
         if not isinstance(self.constrain_initial, bool | np.bool_):
             fail("constrain_initial", f"{self.constrain_initial!r}", "Give True or False")
         self._validate_stages()
@@ -357,10 +358,48 @@ class MPC:
     def require_sizes(self) -> None:
         """Raise ValueError where system or horizon are wrong, which give all else its shape."""
         require_kind("system", self.system, LinearSystem)
-        self.system.validate()
         whole = isinstance(self.horizon, int | np.integer) and not isinstance(self.horizon, bool)
         if not whole or self.horizon < 1:
             fail("horizon", f"{self.horizon!r}", "Give a whole number of steps, at least 1")
+        self.system.validate(self.horizon)
+
+    @property
+    def varying(self) -> tuple[str, ...]:
+        """Names of the data that differ from step to step: "system.A", "Q" and so on."""
+        system = self.system
+        matrices = {
+            "system.A": system.A,
+            "system.B": system.B,
+            "Q": self.Q,
+            "R": self.R,
+            "input_rate_weight": self.input_rate_weight,
+        }
+        found = [name for name, value in matrices.items() if dimensions(value) == 3]
+        return (*found, *(["system.c"] if dimensions(system.c) == 2 else []))
+
+    def require_constant(self, what: str, *names: str) -> None:
+        """Raise ValueError where data differ from step to step that must not in `what`.
+
+        names: of these, or of what they are a part of; none: all data."""
+        for name in self.varying:
+            if not names or name in names or name.split(".")[0] in names:
+                cure = "Give the same at all steps: leave the leading axis out"
+                fail(name, f"differs from step to step, and {what}", cure)
+
+    def _require_weight(self, name: str, size: int, cure: str) -> None:
+        """Raise ValueError unless a weight is a matrix, or one for each step, and none is
+        indefinite."""
+        value, N = getattr(self, name), self.horizon
+        shape = np.shape(as_array(value)) if dimensions(value) is not None else ()
+        if shape == (N, size) != (size, size):
+            cure = f"For the diagonals of {N} steps give {name}[:, :, None] * np.eye({size})"
+        if len(shape) != 3:
+            require_shape(name, value, (size, size), cure)
+            require_symmetric_psd(name, value)
+            return
+        require_shape(name, value, (N, size, size), f"A leading axis counts the {N} steps")
+        for k in range(N if concrete(value) else 0):
+            require_symmetric_psd(f"{name}[{k}]", np.asarray(value)[k])
 
     def _validate_stages(self) -> None:
         N = self.horizon
@@ -419,11 +458,9 @@ class MPC:
         m, W, limit = self.system.m, self.input_rate_weight, self.input_rate_limit
         if W is not None:
             require_real("input_rate_weight", W)
-            if np.shape(W) not in ((m,), (m, m)):
+            if np.ndim(W) < 2:
                 fail("input_rate_weight", f"shape {np.shape(W)}", f"Give ({m}, {m}) or ({m},)")
-            if concrete(W):
-                W = np.asarray(W, float)
-                require_symmetric_psd("input_rate_weight", np.diag(W) if W.ndim == 1 else W)
+            self._require_weight("input_rate_weight", m, "One row for each input")
         if isinstance(limit, Box):
             limit.validate("input_rate_limit", m)
         elif limit is not None:
@@ -443,6 +480,9 @@ class MPC:
                 if getattr(self, name) is not None:
                     fail(name, "given without a disturbance", "Give disturbance=jm.Box(…) too")
             return
+        self.require_constant("policies against a disturbance know one for all", "system")
+        if self.gain is None and self.policy != "affine":
+            self.require_constant("no LQR belongs to it: a disturbance needs a gain then", "Q", "R")
         if self.disturbance_matrix is not None:
             p = self.disturbances
             require_real("disturbance_matrix", self.disturbance_matrix)
@@ -472,23 +512,27 @@ class MPC:
         data = (self.system, self.Q, self.R, self.terminal_cost, self.stage_weights)
         if not concrete(data, self.input_rate_weight):
             return
-        R = host_array("R", self.R)
-        if np.linalg.eigvalsh((R + R.T) / 2)[0] > 0:
-            return
         n, m, N = self.system.n, self.system.m, self.horizon
-        A, B, _ = host_matrices(self.system)
+        all_R, stage = host_array("R", self.R), self.stage_weights
+        lowest = np.linalg.eigvalsh(symmetric(all_R))[..., 0]
+        if np.all(lowest > 0) and (stage is None or np.all(np.asarray(stage) > 0)):
+            return
+        stage = np.ones(N) if stage is None else np.asarray(stage, float)
         zero = lambda size: np.zeros((size, size))
-        as_matrix = lambda W, size: zero(size) if W is None else np.asarray(as_weight(W, size))
-        Q, P = np.asarray(self.Q, float), as_matrix(self.terminal_cost, n)
-        W = as_matrix(self.input_rate_weight, m).astype(float)
-        stage = np.ones(N) if self.stage_weights is None else np.asarray(self.stage_weights, float)
+        each = lambda M: np.broadcast_to(M, (N, *M.shape[-2:]))
+        given = lambda W, size: zero(size) if W is None else np.asarray(W, float)
+        all_R, all_Q = each(all_R), each(np.asarray(self.Q, float))
+        all_A, all_B = map(each, host_matrices(self.system, by_step=True)[:2])
+        all_W = each(given(self.input_rate_weight, m))
         block = lambda a, b, c, d: np.block([[a, b], [c, d]])
-        held = block(A, B, np.zeros((m, n)), np.eye(m))  # u_k = u_{k−1}
-        free, move = block(A, 0 * B, 0 * B.T, zero(m)), np.vstack([B, np.eye(m)])
-        S = size = block(P, 0 * B, 0 * B.T, zero(m))
+        off = np.zeros((n, m))
+        S = size = block(given(self.terminal_cost, n), off, off.T, zero(m))
         moves = self.moves
         for k in reversed(range(N)):
-            cost, effort = block(stage[k] * Q, 0 * B, 0 * B.T, zero(m)), stage[k] * R
+            A, B, W = all_A[k], all_B[k], all_W[k]
+            held = block(A, B, off.T, np.eye(m))  # u_k = u_{k−1}
+            free, move = block(A, off, off.T, zero(m)), np.vstack([B, np.eye(m)])
+            cost, effort = block(stage[k] * all_Q[k], off, off.T, zero(m)), stage[k] * all_R[k]
             if k and moves[k] == moves[k - 1]:
                 own = block(zero(n), 0 * B, 0 * B.T, effort)
                 S, size = cost + own + held.T @ S @ held, abs(cost + own) + _form(held, size)
@@ -530,13 +574,16 @@ def weights_of(mpc: MPC, dtype: Any) -> Weights:
         return symmetric(jnp.diag(value) if value.ndim == 1 else value)
 
     n, m = mpc.system.n, mpc.system.m
-    stage = np.ones(mpc.horizon) if mpc.stage_weights is None else mpc.stage_weights
     Q, R, P = matrix(mpc.Q, n), matrix(mpc.R, m), matrix(mpc.terminal_cost, n)
-    return Weights(Q, R, P, matrix(mpc.input_rate_weight, m), jnp.asarray(stage, dtype))
+    if mpc.stage_weights is not None:
+        stage = jnp.asarray(mpc.stage_weights, dtype)[:, None, None]
+        Q, R = stage * Q, stage * R
+    return Weights(Q, R, P, matrix(mpc.input_rate_weight, m))
 
 
 def dynamics_of(system: LinearSystem, dtype: Any) -> tuple[Array, Array, Array]:
-    """Return A, B and c, zero for None, in one floating type. Works inside jit, vmap and grad."""
+    """Return A, B and c, zero for None, in one floating type, each with a leading axis where it
+    differs from step to step. Works inside jit, vmap and grad."""
     A, B = jnp.asarray(system.A, dtype), jnp.asarray(system.B, dtype)
     return A, B, jnp.zeros(system.n, dtype) if system.c is None else jnp.asarray(system.c, dtype)
 

@@ -22,7 +22,7 @@ from jaxmpc.checks import require_kind
 from jaxmpc.mpc.problem import MPC, Outputs, Soft, output_stages
 from jaxmpc.mpc.tightening import tightened
 from jaxmpc.pytrees import pytree, record, static
-from jaxmpc.qp.linalg import cholesky, matmul
+from jaxmpc.qp.linalg import apply, apply_transposed, cholesky, matmul
 from jaxmpc.qp.problem import Bounds
 from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope
 
@@ -53,16 +53,6 @@ def spread(part: Array, steps: tuple[int, ...], length: int) -> Array:
         ends = (steps[0], length - steps[0] - len(steps))
         return jnp.pad(part, (ends, *[(0, 0)] * (part.ndim - 1)))
     return jnp.zeros((length, *part.shape[1:]), part.dtype).at[np.array(steps, int)].add(part)
-
-
-def apply(M: Array, v: Array) -> Array:
-    """Return M_k v_k, or M v_k, for all steps: M (N, a, b) or (a, b), v (N, b)."""
-    return matmul(v, M.T) if M.ndim == 2 else matmul(M, v[..., None])[..., 0]
-
-
-def apply_transposed(M: Array, v: Array) -> Array:
-    """Return M_k'v_k, or M'v_k, for all steps."""
-    return matmul(v, M) if M.ndim == 2 else matmul(v[..., None, :], M)[..., 0, :]
 
 
 @pytree
@@ -307,7 +297,7 @@ def stacked(
 
 def _each(H: Array, M: Array) -> Array:
     """Return H M_k, or H v_k for vectors, for every step."""
-    return matmul(H, M) if M.ndim == 3 else matmul(M, H.T)
+    return matmul(H, M) if M.ndim == 3 else apply(H, M)
 
 
 def layout(mpc: MPC) -> Layout:

@@ -55,6 +55,30 @@ def matmul(a: Array, b: Array) -> Array:
     return jnp.matmul(a, b, precision=PRECISION)
 
 
+def apply(M: Array, v: Array) -> Array:
+    """Return M_k v_k, or M v_k, for all steps: M (N, a, b) or (a, b), v (N, b)."""
+    return matmul(v, M.T) if M.ndim == 2 else matmul(M, v[..., None])[..., 0]
+
+
+def apply_transposed(M: Array, v: Array) -> Array:
+    """Return M_k'v_k, or M'v_k, for all steps."""
+    return matmul(v, M) if M.ndim == 2 else matmul(v[..., None, :], M)[..., 0, :]
+
+
+def by_step(*data: tuple[Array, int]) -> tuple[tuple[Any, ...], Callable[[tuple], tuple]]:
+    """Return what a scan over the steps reads of arrays, None of one that is the same at all steps,
+    and the function that returns all of them at the step of which it is given that part.
+
+    data: each array, and the number of axes that it has at one step.
+    """
+    each = tuple(v if v.ndim > axes else None for v, axes in data)
+
+    def at(part: tuple) -> tuple:
+        return tuple(v if own is None else own for (v, _), own in zip(data, part, strict=True))
+
+    return each, at
+
+
 def arrays(tree: T) -> T:
     """Leaves as JAX arrays of the present precision, before they enter `jit`.
 

@@ -41,6 +41,7 @@ class LinearSystem:
         state_names, input_names: tuples of n and m names; empty means x1..xn, u1..um.
         state_units, input_units: tuples of n and m units ("rad", "N m"); empty means none.
 
+    In an `MPC` each of A, B and c may have a leading axis of N steps.
     A, B and c are pytree leaves (they may be batched and differentiated); the rest is
     static. The constructor checks nothing, `validate` does, and takes a vector B (n,) as one input.
     """
@@ -91,24 +92,28 @@ class LinearSystem:
         after = matmul(A, x) + matmul(B, jnp.asarray(u, x.dtype))
         return after if self.c is None else after + jnp.asarray(self.c, x.dtype)
 
-    def validate(self) -> None:
-        """Raise ValueError for wrong shapes, non-finite entries, bad dt or bad names."""
+    def validate(self, steps: int | None = None) -> None:
+        """Raise ValueError for wrong shapes, non-finite entries, bad dt or bad names.
+
+        steps: A, B and c may have a leading axis of this length, as in an `MPC`; None: none has.
+        """
         for name in ("A", "B") if self.c is None else ("A", "B", "c"):
             value = getattr(self, name)
             if concrete(value):
                 require_finite(name, host_array(name, value))
-        for name, shape in (("A", "(n, n)"), ("B", "(n, m)")):
-            given = np.shape(as_array(getattr(self, name)))
+        A, B = (self._at_one_step(name, 2, steps) for name in ("A", "B"))
+        for name, value, shape in (("A", A, "(n, n)"), ("B", B, "(n, m)")):
+            given = np.shape(value)
             if len(given) != 2 or 0 in given:
-                fail(name, f"shape {given} is not {shape}", "Give a matrix")
+                cure = "Give a matrix; one for each step is known to an MPC alone"
+                fail(name, f"shape {given} is not {shape}", cure)
         n, m = self.n, self.m
-        require_shape("A", as_array(self.A), (n, n), "A must be square")
-        require_shape("B", as_array(self.B), (n, m), "Give B as many rows as A")
+        require_shape("A", A, (n, n), "A must be square")
+        require_shape("B", B, (n, m), "Give B as many rows as A")
         if self.c is not None:
             outputs = "outputs are no part of a system: see jm.Outputs"
-            require_shape(
-                "c", as_array(self.c), (n,), f"Give one number a state, or None; {outputs}"
-            )
+            cure = f"Give one number a state, or None; {outputs}"
+            require_shape("c", self._at_one_step("c", 1, steps), (n,), cure)
         if self.dt is not None:
             require_period("dt", self.dt)
         for kind, count in (("state", n), ("input", m)):
@@ -117,6 +122,16 @@ class LinearSystem:
             names = getattr(self, f"{kind}_names")
             if len(set(names)) < len(names):
                 fail(f"{kind}_names", f"{names} has a name twice", "Give each a name of its own")
+
+    def _at_one_step(self, name: str, axes: int, steps: int | None) -> Any:
+        """Return A, B or c at the first step, or as it is where it has no more than these axes."""
+        value = as_array(getattr(self, name))
+        shape = np.shape(value)
+        if steps is None or len(shape) != axes + 1:
+            return value
+        if shape[0] != steps:
+            fail(name, f"shape {shape}", f"A leading axis counts the {steps} steps of the horizon")
+        return value[0] if steps else value
 
     @classmethod
     def from_continuous(
@@ -209,10 +224,18 @@ class LinearSystem:
         return system
 
 
-def host_matrices(system: LinearSystem) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return A (n, n), B (n, m) and c (n,), zero for None, as float64 NumPy arrays."""
+def host_matrices(
+    system: LinearSystem, *, by_step: bool = False
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return A (n, n), B (n, m) and c (n,), zero for None, as float64 NumPy arrays. by_step: each
+    may have a leading axis of steps; else raise ValueError for one that has."""
     A, B = host_array("A", system.A), host_array("B", system.B)
-    return A, B, np.zeros(len(A)) if system.c is None else host_array("c", system.c)
+    c = np.zeros(A.shape[-1]) if system.c is None else host_array("c", system.c)
+    for name, value, axes in (("A", A, 2), ("B", B, 2), ("c", c, 1)):
+        if value.ndim > axes and not by_step:
+            what = f"shape {value.shape}: the system differs from step to step"
+            fail(f"system.{name}", what, "Here it is the same at all: leave the axis out")
+    return A, B, c
 
 
 def _labels(

@@ -220,8 +220,8 @@ def test_stage_weights():
     ):
         np.testing.assert_allclose(plan.inputs[:, 0], exact, rtol=1e-9)
         np.testing.assert_allclose(plan.cost, np.sum((rows @ exact - aim) ** 2), rtol=1e-9)
-    with pytest.raises(ValueError, match="stage_weights.*positive"):
-        replace(mpc, stage_weights=[1.0, 0.0, 1.0, 1.0]).validate()
+    with pytest.raises(ValueError, match="stage_weights.*at least 0"):
+        replace(mpc, stage_weights=[1.0, -1.0, 1.0, 1.0]).validate()
     with pytest.raises(ValueError, match=r"stage_weights.*\(4,\)"):
         replace(mpc, stage_weights=s[:3]).validate()
 

@@ -81,7 +81,7 @@ def distance(s: Stages, E: Array, rho: Array, u: Array, y: Array) -> Array:
     the plan of a state far off.
     """
     _, c, gradient = Errors.of(s, E, rho, u, y)
-    weight = jnp.diagonal(s.R, axis1=-2, axis2=-1) * s.stage[:, None]
+    weight = jnp.diagonal(s.R, axis1=-2, axis2=-1)
     return jnp.sum(rho * c**2) + jnp.sum(gradient**2 / jnp.where(weight > 0, weight, 1.0))
 
 

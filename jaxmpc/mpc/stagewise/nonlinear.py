@@ -32,10 +32,10 @@ from jaxmpc.checks import (
 )
 from jaxmpc.mpc.plan import Aim
 from jaxmpc.mpc.problem import MPC, dynamics_of
-from jaxmpc.mpc.rows import Rows, apply, apply_transposed, at, joined_bounds, spread
+from jaxmpc.mpc.rows import Rows, at, joined_bounds, spread
 from jaxmpc.mpc.stagewise.stages import Stages, remembering
 from jaxmpc.pytrees import named_pytree, pytree, static, static_pytree
-from jaxmpc.qp.linalg import matmul, symmetric
+from jaxmpc.qp.linalg import apply, apply_transposed, matmul, symmetric
 from jaxmpc.qp.problem import Bounds
 from jaxmpc.systems.system import LinearSystem
 
@@ -286,10 +286,10 @@ def total_cost(s: Stages, problem: NonlinearMPC, x: Array, u: Array) -> Array:
     """Return the cost of a trajectory without penalties; s: `Stages` of the MPC."""
     aim = s.aim
     e, d = x - aim.states, u - aim.inputs
-    J = jnp.sum(s.stage * (jnp.sum(e[:-1] * apply(s.Q, e[:-1]), 1) + jnp.sum(d * apply(s.R, d), 1)))
+    J = jnp.sum(e[:-1] * apply(s.Q, e[:-1])) + jnp.sum(d * apply(s.R, d))
     J = J + jnp.sum(e[-1] * matmul(e[-1], s.P.T))
     if s.cross is not None:
-        J = J + 2 * jnp.sum(s.stage * jnp.sum(d * apply(s.cross, e[:-1]), 1))
+        J = J + 2 * jnp.sum(d * apply(s.cross, e[:-1]))
     for task, value, target in zip(problem.tasks, problem.values(x, u), aim.targets, strict=True):
         J = J + task_cost(task, value, at(target, task.at(len(u))))
     return J
@@ -317,9 +317,7 @@ def expanded(s: Stages, problem: NonlinearMPC, x: Array, u: Array) -> Stages:
     """Return the problem about x (N+1, n), u (N, m); s: `Stages` of the MPC."""
     N, dtype = s.horizon, s.P.dtype
     A, B, c = jax.vmap(lambda x, u: linear_model(problem.model, x, u))(x[:-1], u)
-    weights = s.stage[:, None, None]
-    Q, R, P = weights * s.Q, weights * s.R, s.P
-    cross = None if s.cross is None else weights * s.cross
+    Q, R, P, cross = s.Q, s.R, s.P, s.cross
     gx, gu = s.gradient(x, u)
     blocks, bounds = list(s.blocks), [s.bounds]
     for task, target in zip(problem.tasks, s.aim.targets, strict=True):
@@ -352,7 +350,6 @@ def expanded(s: Stages, problem: NonlinearMPC, x: Array, u: Array) -> Stages:
         R=R,
         P=P,
         cross=cross,
-        stage=jnp.ones_like(s.stage),
         blocks=tuple(blocks),
         bounds=joined_bounds(bounds, dtype),
         aim=Aim(s.aim.x0, x, u, slopes=(gx, gu)),
@@ -422,9 +419,8 @@ def curved(
         where = join(at(x, steps), at(u, steps))
         found = jax.vmap(of_task)(where, at(target, steps), pull)
         blocks = blocks + spread(found, steps, N + 1)
-    weights = s.stage[:, None, None] * base.stage[:, None, None]
-    Q, R = weights * base.Q + blocks[:-1, :n, :n], weights * base.R + blocks[:-1, n:, n:]
+    Q, R = base.Q + blocks[:-1, :n, :n], base.R + blocks[:-1, n:, n:]
     cross = blocks[:-1, n:, :n]
     if base.cross is not None:
-        cross = cross + weights * base.cross
+        cross = cross + base.cross
     return replace(s, Q=Q, R=R, cross=cross, P=base.P + blocks[-1, :n, :n])

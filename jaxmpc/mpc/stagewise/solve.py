@@ -24,8 +24,8 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike, DTypeLike
 
-from jaxmpc.arrays import Reals, all_finite, as_array, host_array
-from jaxmpc.checks import concrete, fail, require_finite, require_kind
+from jaxmpc.arrays import Reals, all_finite
+from jaxmpc.checks import fail, require_kind
 from jaxmpc.mpc.plan import Aim, Plan, WarmStart, answer, checked_aim
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import at, layout, row_count
@@ -64,7 +64,6 @@ from jaxmpc.qp.residuals import Measured, Pair, Proof, assess, with_status
 from jaxmpc.qp.solve import tolerance
 from jaxmpc.qp.status import Status
 from jaxmpc.sets.convex_sets import Ellipsoid
-from jaxmpc.systems.system import LinearSystem
 
 # Most stages that the passes of an ADMM step write out, without a loop over them. Loops reorder
 # (batch, N, …) to (N, batch, …) at each step, which takes longer than the products.
@@ -87,8 +86,8 @@ def solve_stagewise(
     """Solve an MPC problem stage by stage from the state x0 (n,): what takes the least time where
     the system is another one in each problem, or at each step.
 
-    A (n, n), B (n, m) and c (n,) of mpc.system may have a leading axis N:
-    x_{k+1} = A_k x_k + B_k u_k + c_k. `replace(mpc, system=...)` puts a system into a problem.
+    A (n, n), B (n, m) and c (n,) of mpc.system may have a leading axis N, as for `solve`.
+    `replace(mpc, system=...)` puts a system into a problem.
 
     x0, references, previous_input, solver and the Plan are those of `solve`, and so is the status:
     residuals and gap of the returned inputs and multipliers, evaluated from the data in float64.
@@ -132,8 +131,6 @@ def checked(mpc: MPC, solver: ADMM) -> MPC:
     """The problem without prestabilising gain; ValueError for what is wrong with it or the solver,
     and for what is not solved stage by stage."""
     require_kind("mpc", mpc, MPC)
-    system = mpc.system
-    require_kind("system", system, LinearSystem)
     for name, found in (
         ("terminal_set is an Ellipsoid", isinstance(mpc.terminal_set, Ellipsoid)),
         ("control_horizon is given", mpc.control_horizon is not None),
@@ -141,24 +138,11 @@ def checked(mpc: MPC, solver: ADMM) -> MPC:
     ):
         if found:
             fail("mpc", name, "Stage by stage there is no such thing: use jm.solve")
-    first: dict[str, Any] = {}
-    for name, dimensions in (("A", 2), ("B", 2), ("c", 1)):
-        value = getattr(system, name)
-        if value is None:
-            continue
-        if concrete(value):
-            require_finite(name, host_array(name, value))
-        value = as_array(value)
-        shape = np.shape(value)
-        staged = len(shape) == dimensions + 1
-        if staged and shape[0] != mpc.horizon:
-            fail(name, f"shape {shape}", f"A leading axis counts the {mpc.horizon} steps")
-        first[name] = value[0] if staged and shape[0] else value
-    at_first = replace(mpc, system=replace(system, **first), prestabilise=None)
-    at_first.validate()
-    at_first.require_unique_inputs()  # the recursion divides by R + B'SB
+    mpc = replace(mpc, prestabilise=None)
+    mpc.validate()
+    mpc.require_unique_inputs()  # the recursion divides by R + B'SB
     solver.validate(row_count(layout(mpc)))
-    return replace(mpc, prestabilise=None)
+    return mpc
 
 
 @pytree

@@ -30,7 +30,7 @@ from jax.typing import ArrayLike, DTypeLike
 from jaxmpc.arrays import Reals, all_finite
 from jaxmpc.checks import fail, require_kind, whole
 from jaxmpc.mpc.plan import Aim, Plan, WarmStart, answer, checked_aim, checked_array
-from jaxmpc.mpc.rows import apply, dynamics_terms, row_count, split, spread
+from jaxmpc.mpc.rows import dynamics_terms, row_count, split, spread
 from jaxmpc.mpc.stagewise.newton_steps import INTERIOR_STEPS, Search, stage_conditions
 from jaxmpc.mpc.stagewise.nonlinear import (
     NonlinearMPC,
@@ -60,7 +60,7 @@ from jaxmpc.mpc.stagewise.stages import (
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.admm import ADMM, DEFAULT, default_rho, scaled_multipliers
 from jaxmpc.qp.jax_transformations import Undo, implicit, own_modes, repeat_while, varying
-from jaxmpc.qp.linalg import arrays, cholesky, precisely, rounding
+from jaxmpc.qp.linalg import apply, arrays, cholesky, precisely, rounding
 from jaxmpc.qp.newton import Constants
 from jaxmpc.qp.residuals import SHARE, Measured, Proof, Terms, assess
 from jaxmpc.qp.solve import tolerance

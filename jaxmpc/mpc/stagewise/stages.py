@@ -33,8 +33,6 @@ from jaxmpc.mpc.problem import MPC, dynamics_of, weights_of
 from jaxmpc.mpc.rows import (
     Layout,
     Rows,
-    apply,
-    apply_transposed,
     blocks,
     bounds_of,
     layout_of,
@@ -44,7 +42,14 @@ from jaxmpc.mpc.rows import (
 from jaxmpc.mpc.stagewise.recursion_kernels import Gains, recurrence, riccati_recursion, tracking
 from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.admm import convex
-from jaxmpc.qp.linalg import floating_dtype, matmul, precisely, rounding
+from jaxmpc.qp.linalg import (
+    apply,
+    apply_transposed,
+    floating_dtype,
+    matmul,
+    precisely,
+    rounding,
+)
 from jaxmpc.qp.problem import Bounds
 from jaxmpc.qp.residuals import SHARE, Pair, Terms
 from jaxmpc.qp.status import Status
@@ -55,8 +60,8 @@ class Stages:
     """The data of a problem in one floating type.
 
     A (n, n), B (n, m), c (n,), or with a leading axis N. Q, R, P: weights, without ½; P of x_N; Q
-    and R may have a leading axis N; cross M (N, m, n): of the term 2 u'M x, None for zero; stage
-    (N,): weights of the stages, of all three.
+    and R may have a leading axis N; cross M (m, n), or (N, m, n): of the term 2 u'M x, None for
+    zero.
     blocks, bounds: the rows of `rows.blocks`, and what is asked of all of them (rows,). aim: where
     a plan begins and what it tracks, with full references; none of it until it is known.
     remembers: whether the state is (x_k, u_{k−1}), and n its size.
@@ -68,7 +73,6 @@ class Stages:
     Q: Array
     R: Array
     P: Array
-    stage: Array
     blocks: tuple[Rows, ...]
     bounds: Bounds
     horizon: int = static()
@@ -81,14 +85,12 @@ class Stages:
         """Return the data of `mpc`. Works inside jit, vmap and grad."""
         dtype = floating_dtype(mpc)
         A, B, c = dynamics_of(mpc.system, dtype)
-        Q, R, P, W, stage = weights_of(mpc, dtype)
+        Q, R, P, W = weights_of(mpc, dtype)
         found = blocks(mpc, dtype)
         rows = tuple(Rows(b.kind, b.H, b.D, b.steps, b.box) for b in found)
-        s = cls(A, B, c, Q, R, P, stage, rows, bounds_of(found, dtype), mpc.horizon)
+        s = cls(A, B, c, Q, R, P, rows, bounds_of(found, dtype), mpc.horizon)
         if not mpc.input_in_state:
             return s
-        if mpc.stage_weights is not None:  # they are not those of rates
-            W = W / jnp.where(stage > 0, stage, 1.0)[:, None, None]
         weight = None if mpc.input_rate_weight is None else W
         return _with_rates(s, weight, [block.rate for block in found])
 
@@ -135,12 +137,12 @@ class Stages:
 
     def gradient(self, x: Array, u: Array) -> tuple[Array, Array]:
         """Of J at x, u: (N+1, n) and (N, m)."""
-        aim, stage = self.aim, self.stage[:, None]
+        aim = self.aim
         e, d = 2 * (x - aim.states), 2 * (u - aim.inputs)
         gx, gu = apply(self.Q, e[:-1]), apply(self.R, d)
         if self.cross is not None:
             gx, gu = gx + apply_transposed(self.cross, d), gu + apply(self.cross, e[:-1])
-        gradient = jnp.concatenate([stage * gx, apply(self.P, e[-1:])]), stage * gu
+        gradient = jnp.concatenate([gx, apply(self.P, e[-1:])]), gu
         return gradient if aim.slopes is None else jax.tree.map(jnp.add, gradient, aim.slopes)
 
     def varying(self, *names: str) -> list[Any]:
@@ -172,7 +174,8 @@ def _with_rates(s: Stages, W: Array | None, rates: list[bool]) -> Stages:
         if rate:
             H: Any = jnp.pad(-jnp.eye(m, dtype=s.P.dtype), [(0, 0), (n, 0)])
         else:
-            H = None if block.H is None else jnp.pad(block.H, [(0, 0), (0, m)])
+            axes = [(0, 0)] * (0 if block.H is None else block.H.ndim - 1)
+            H = None if block.H is None else jnp.pad(block.H, [*axes, (0, m)])
         found.append(replace(block, H=H, box=block.box and H is None))
     Q, R, P, cross = _padded(s.Q, m), s.R, _padded(s.P, m), None
     if W is not None:
@@ -200,7 +203,7 @@ def cleaned(s: Stages) -> tuple[Stages, Array]:
     Each array by itself: what a batch shares is read and cleaned once, whatever its instances hold.
     """
     everywhere = lambda *tests: jnp.all(jnp.stack([jnp.all(test) for test in tests]))
-    numbers = jax.tree.leaves((s.A, s.B, s.c, s.Q, s.R, s.P, s.stage, s.blocks))
+    numbers = jax.tree.leaves((s.A, s.B, s.c, s.Q, s.R, s.P, s.blocks))
     lower, upper = s.bounds.l, s.bounds.u
     ordered = (lower <= upper) & ~jnp.isposinf(lower) & ~jnp.isneginf(upper)
     tests = [*map(jnp.isfinite, numbers), ordered]
@@ -216,8 +219,7 @@ def cleaned(s: Stages) -> tuple[Stages, Array]:
     Q, R, P, cross = finite((s.Q, s.R, s.P, s.cross))
     sound = lambda M: jnp.all(jax.vmap(convex)(M)) if M.ndim == 3 else convex(M)
     convexity = [sound(Q), sound(R), sound(P)]
-    positive = jnp.isfinite(s.stage) & (s.stage > 0)
-    fault = jnp.where(everywhere(*convexity, positive), Status.NOT_RUN, Status.NON_CONVEX)
+    fault = jnp.where(everywhere(*convexity), Status.NOT_RUN, Status.NON_CONVEX)
     fault = jnp.where(everywhere(*tests), fault, Status.NON_FINITE).astype(jnp.int32)
     identity = jnp.broadcast_to(jnp.eye(R.shape[-1], dtype=R.dtype), R.shape)
     Q, R, P = map(jnp.where, convexity, (Q, R, P), (jnp.zeros_like(Q), identity, jnp.zeros_like(P)))
@@ -231,7 +233,6 @@ def cleaned(s: Stages) -> tuple[Stages, Array]:
         Q=Q,
         R=R,
         P=P,
-        stage=jnp.where(positive, s.stage, 1.0),
         blocks=finite(s.blocks),
         bounds=Bounds(lower, upper, linear, quadratic),
         cross=cross,
@@ -241,10 +242,11 @@ def cleaned(s: Stages) -> tuple[Stages, Array]:
 
 def riccati(s: Stages, weights: Any = None) -> Gains:
     """Gains for the cost and ½ Σ weights·row², weights (rows,) or None."""
-    N, stage = s.horizon, s.stage[:, None, None]
-    Q = 2 * jnp.concatenate([stage * s.Q, s.P[None]])
-    R = 2 * stage * s.R
-    cross = None if s.cross is None else 2 * stage * s.cross
+    N = s.horizon
+    each = lambda M: jnp.broadcast_to(M, (N, *M.shape[-2:]))
+    Q = 2 * jnp.concatenate([each(s.Q), s.P[None]])
+    R = 2 * each(s.R)
+    cross = None if s.cross is None else 2 * each(s.cross)
     for block, w in () if weights is None else s.by_block(weights):
         H, D, steps, box = block.H, block.D, block.steps, block.box
         diagonal = lambda w: w[:, :, None] * jnp.eye(w.shape[1], dtype=w.dtype)
