@@ -9,7 +9,7 @@ from jaxmpc.arrays import Reals
 from jaxmpc.checks import fail, require_finite, require_shape
 from jaxmpc.mpc.controller import zeros_of
 from jaxmpc.mpc.plan import Control, limited
-from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.problem import MPC, at_stage
 from jaxmpc.pytrees import named_pytree, pytree
 from jaxmpc.qp.linalg import floating_dtype, matmul
 from jaxmpc.qp.status import Status
@@ -129,7 +129,8 @@ class LinearFeedback:
     @property
     def limits(self) -> Any:
         """Return the state limits by which a closed loop is evaluated."""
-        return self.mpc.states if self.plant is None else self.plant.state_limits
+        states = at_stage(self.mpc.states, 0)
+        return states if self.plant is None else self.plant.state_limits
 
     def coordinates(self, x: Array) -> Array:
         """Return the coordinates ξ (n,) of a state."""

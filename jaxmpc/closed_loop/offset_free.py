@@ -221,6 +221,7 @@ def augmented(mpc: MPC, observer: KalmanFilter) -> MPC:
     """
     require_kind("mpc", mpc, MPC)
     mpc.validate()
+    mpc.require_constant("observers and their disturbances know one problem for all")
     require_kind("observer", observer, KalmanFilter)
     observer = observer.prepared()
     system = mpc.system

@@ -32,7 +32,7 @@ from jaxmpc.explicit.parametric_program import (
     in_numpy,
 )
 from jaxmpc.mpc.condense import Inequalities, condensed_in_float64
-from jaxmpc.mpc.problem import MPC, RELAX
+from jaxmpc.mpc.problem import MPC, RELAX, at_stage
 from jaxmpc.pytrees import record
 from jaxmpc.sets.convex_sets import Box, Polytope, unit_half_spaces
 from jaxmpc.sets.geometry import (
@@ -290,7 +290,8 @@ class GivenProgram(NamedTuple):
             alone = cost_of_parameters(problem, c)[2]
             output = Output(*(np.asarray(part[0]) for part in (c.Omega, c.Psi, c.psi)))
             if problem.input_in_state and problem.inputs is not None:  # one that was applied
-                H_u, h_u = unit_half_spaces("inputs", problem.inputs, problem.system.m)
+                applied = at_stage(problem.inputs, 0)
+                H_u, h_u = unit_half_spaces("inputs", applied, problem.system.m)
                 H_u = np.pad(H_u, ((0, 0), (problem.system.n, 0)))
                 H, h = np.vstack([H, H_u]), np.append(h, h_u)
         C, D = np.vstack([C, np.zeros((len(h), C.shape[1]))]), np.vstack([D, H])

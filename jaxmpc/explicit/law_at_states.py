@@ -13,7 +13,7 @@ from scipy.optimize import lsq_linear, nnls
 from jaxmpc.explicit.regions import CriticalRegions
 from jaxmpc.mpc.condense import Inequalities, condensed_in_float64
 from jaxmpc.mpc.many import solve_many
-from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.problem import MPC, at_stage
 from jaxmpc.pytrees import record
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status
@@ -72,7 +72,7 @@ class Law:
     def limited(self, u: np.ndarray) -> np.ndarray:
         """Return inputs (B, m) clipped into a box of limits: an actuator takes no rounding beyond
         them."""
-        box = self.mpc.inputs
+        box = at_stage(self.mpc.inputs, 0)
         if not isinstance(box, Box):
             return u
         return np.clip(u, np.asarray(box.lower), np.asarray(box.upper))

@@ -10,7 +10,7 @@ import numpy as np
 from jaxmpc.checks import fail, number
 from jaxmpc.files import versions
 from jaxmpc.mpc.plan import rate_ends
-from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.problem import MPC, at_stage
 from jaxmpc.pytrees import record
 from jaxmpc.sets.convex_sets import Box
 
@@ -112,7 +112,8 @@ def input_limits(mpc: MPC) -> dict[str, np.ndarray]:
     """Return the tables of the limits (m,) into which the code clips inputs, ±inf for none, and
     their changes, where these are limited."""
     free = np.full(mpc.system.m, np.inf)
-    ends = (mpc.inputs.lower, mpc.inputs.upper) if isinstance(mpc.inputs, Box) else (-free, free)
+    inputs = at_stage(mpc.inputs, 0)
+    ends = (inputs.lower, inputs.upper) if isinstance(inputs, Box) else (-free, free)
     tables: dict[str, Any] = dict(zip(("input_lower", "input_upper"), ends, strict=True))
     if mpc.rate_limited:
         tables |= zip(("rate_lower", "rate_upper"), rate_ends(mpc), strict=True)

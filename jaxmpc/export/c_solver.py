@@ -221,6 +221,7 @@ def check_fixed_steps(
     require_kind("mpc", mpc, MPC)
     require_tightened(mpc, "C code")
     require_kind("solver", solver, ADMM)
+    mpc.require_constant("closed loops need one system for all time steps", "system")
     whole("plans", plans, 1)
     number("tolerance", tolerance, 0, "Give a positive number")
     require_box(mpc, lower, upper)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxmpc.checks import fail, require_kind
 from jaxmpc.feasible.plan_polytope import DIMENSIONS, FACETS, CenteredPolytope, projected
 from jaxmpc.feasible.policy_problem import problem_of
-from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.problem import HARD, MPC
 from jaxmpc.pytrees import record
 from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope
 from jaxmpc.sets.geometry import unit_rows
@@ -60,6 +60,7 @@ def any_policy_polytope(mpc: MPC) -> Polytope:
     """
     require_kind("mpc", mpc, MPC)
     mpc.validate()
+    mpc.require_constant("steps back from the terminal set are all the same", *HARD)
     if not is_standard_form(mpc) or not mpc.constrain_initial or mpc.states is None or mpc.soft:
         what = "has other limits than those of states and inputs at the usual steps"
         fail("mpc", what, "Give it without them")
@@ -95,6 +96,7 @@ def feasible_growth(mpc: MPC, horizons: Sequence[int]) -> Growth:
     Raises ValueError as `feasible_polytope` does, and where steps or blocks of `mpc` fit one
     horizon only.
     """
+    mpc.require_constant("it has the length of one horizon", *HARD)
     sets = tuple(feasible_polytope(replace(mpc, horizon=int(N))) for N in horizons)
     return Growth(
         horizons=np.array(horizons, int),
@@ -150,4 +152,4 @@ def is_standard_form(mpc: MPC) -> bool:
     """Return whether limits are on states and inputs alone, at the standard steps, with inputs free
     at each step."""
     free = not (mpc.outputs or mpc.rate_limited) and mpc.control_horizon is None
-    return free and mpc.constrained_stages is None
+    return free and mpc.constrained_stages is None and not mpc.differs(*HARD)

@@ -15,7 +15,7 @@ from jaxmpc.feasible.hard_constraints import Axes, ExactData, View, make_view
 from jaxmpc.feasible.plan_polytope import PlanPolytope
 from jaxmpc.files import as_json
 from jaxmpc.mpc.condense import Condensed, condensed_in_float64
-from jaxmpc.mpc.problem import MPC, Outputs, as_tuple
+from jaxmpc.mpc.problem import HARD, MPC, Outputs, as_tuple
 from jaxmpc.mpc.rows import Block
 from jaxmpc.mpc.tightening import feedback_gain, require_tightened, without_disturbance
 from jaxmpc.pytrees import record
@@ -49,6 +49,7 @@ class FeasibilityProblem:
         require_kind("mpc", mpc, MPC)
         mpc.validate()
         require_tightened(mpc, "what labels by one sequence of inputs")
+        mpc.require_constant("the feasible set is that of one problem", *HARD)
         boxes = {name: as_box(getattr(mpc, name)) for name in ("states", "inputs", "terminal_set")}
         hard = with_equalities(replace(mpc, soft=(), input_rate_weight=None, **boxes))
         return cls(hard, make_view(hard, axes, fixed))

@@ -46,7 +46,7 @@ from jaxmpc.mpc.plan import (
     within_limits,
 )
 from jaxmpc.mpc.policy_rows import PolicyCondensed, condensed_plan
-from jaxmpc.mpc.problem import MPC, dynamics_of
+from jaxmpc.mpc.problem import MPC, at_stage, dynamics_of
 from jaxmpc.mpc.rows import blocks, dynamics_terms, given_blocks, split
 from jaxmpc.mpc.tightening import with_gain
 from jaxmpc.pytrees import prepared_pytree
@@ -131,8 +131,9 @@ class Controller:
 
     @property
     def limits(self) -> Box | Polytope | None:
-        """The set by which violations of a closed loop are measured."""
-        return self.mpc.states
+        """The set by which violations of a closed loop are measured; of limits that differ from
+        stage to stage those of the first."""
+        return at_stage(self.mpc.states, 0)
 
     def coordinates(self, x: Array) -> Array:
         """The state in which `mpc` is written: x itself."""
@@ -172,7 +173,7 @@ class Controller:
         """
         c = self.condensed
         start = WarmStart.of(plan, c.layout, self.mpc)
-        tail = within_limits(self.mpc, matmul(c.K_N, start.states[-1]), start.inputs[-1])
+tail = within_limits(self.mpc, matmul(c.K_N, start.states[-1]), start.inputs[-1])
         return start.shifted(c.layout, tail, bool(c.balls))
 
     def plan(

@@ -14,7 +14,7 @@ from jax import Array
 
 from jaxmpc.arrays import Reals, as_array, host_array
 from jaxmpc.checks import fail
-from jaxmpc.mpc.problem import MPC, weights_of
+from jaxmpc.mpc.problem import MPC, at_stage, weights_of
 from jaxmpc.mpc.rows import Block, Layout, blocks, given_blocks, layout, row_count, row_table, split
 from jaxmpc.pytrees import named_pytree, pytree
 from jaxmpc.qp.linalg import apply, arrays
@@ -288,14 +288,19 @@ def answer(
     )
 
 
-def limited(inputs: Any, u: Array) -> Array:
-    """Return u clipped into the input limits, if these are a Box: no rounding beyond them."""
-    return _between(u, inputs.lower, inputs.upper) if isinstance(inputs, Box) else u
+def limited(inputs: Any, u: Array, stage: int = 0) -> Array:
+    """Return u clipped into the input limits of a stage, if these are a Box: no rounding beyond
+    them."""
+    if not isinstance(inputs, Box):
+        return u
+    here = at_stage(inputs, stage)
+    return _between(u, here.lower, here.upper)
 
 
 def rate_ends(mpc: MPC) -> tuple[Any, Any]:
-    """Return the least and the largest change of the inputs in one time step, (m,)."""
+    """Return the least and the largest change of the inputs in the first time step, (m,)."""
     limit: Any = mpc.input_rate_limit
+    limit = limit[0] if np.ndim(limit) == 2 else at_stage(limit, 0)
     return (limit.lower, limit.upper) if isinstance(limit, Box) else (jnp.negative(limit), limit)
 
 

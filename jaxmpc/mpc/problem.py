@@ -1,9 +1,9 @@
 """The constrained MPC problem as a user states it, and the same one with soft or hard limits."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -34,12 +34,32 @@ from jaxmpc.sets.disturbances import require_disturbance
 from jaxmpc.sets.limits import output_limits
 from jaxmpc.systems.system import LinearSystem, host_matrices
 
+T = TypeVar("T")
+
 # Curvature of the cost, relative to its terms, below which a direction of the inputs costs nothing.
 FLAT = 1e-12
 # What helps where no state has a plan; without a terminal set no longer horizon: X_{N+1} ⊆ X_N.
 RELAX = "Relax a limit; with a terminal set enlarge that or lengthen the horizon"
+# What decides whether a state has a plan and may differ from step to step.
+HARD = ("system", "states", "inputs", "outputs", "input_rate_limit")
 # How inputs answer to disturbances: see `MPC`.
 POLICIES = ("tightened", "tube", "affine")
+
+
+# Axes that the arrays of limits have at one stage: with one more they differ from stage to stage.
+AXES = {"lower": 1, "upper": 1, "H": 2, "h": 1, "C": 2, "D": 2, "rho": 1, "quadratic": 1}
+
+
+def differing(part: Any) -> tuple[str, ...]:
+    """Return the names of the arrays of a set, or of rows, that differ from stage to stage."""
+    return tuple(k for k, axes in AXES.items() if dimensions(getattr(part, k, None)) == axes + 1)
+
+
+def at_stage(part: T, j: int) -> T:
+    """Return a set, or rows, at the j-th of the stages at which it holds."""
+    names = differing(part)
+    values = {name: as_array(getattr(part, name))[j] for name in names}
+    return replace(part, **values) if names else part  # type: ignore[type-var]
 
 
 class TwoSided:
@@ -52,7 +72,7 @@ class TwoSided:
     def sides(self) -> tuple[Any, Any]:
         """(lower, upper), infinite where there is no such side."""
         lower, upper = self.lower, self.upper
-        free = np.full(np.shape(as_array(upper if lower is None else lower)), np.inf)
+        free = np.full(np.shape(as_array(upper if lower is None else lower))[-1:], np.inf)
         return (-free if lower is None else lower), (free if upper is None else upper)
 
 
@@ -68,6 +88,8 @@ class Outputs(TwoSided):
         stages: the k at which they hold; None: those of the state limits, and where the state
             limits hold at k = N, without D there too.
         names, units: of the p outputs, for tables and pictures; () for none.
+
+    C, D, lower and upper may have a leading axis, an entry for each of the stages.
     """
 
     C: Reals
@@ -95,6 +117,7 @@ class Soft(TwoSided):
         quadratic: ≥ 0, in cost per squared unit; a number or (p,).
         stages: the k at which they hold; None: k = 0..N, with D k = 0..N−1.
 
+    C, D, lower, upper, rho and quadratic may have a leading axis, an entry for each of the stages.
     For ρ above the greatest multiplier of the hard rows (`exact_penalty`) the plan violates them
     only where the hard problem has no solution.
     """
@@ -161,8 +184,10 @@ class MPC:
             (N, n, n).
         R: (m, m) ⪰ 0, or its diagonal (m,), or a number for one input; or (N, m, m).
         horizon: N ≥ 1.
-        states: Box or Polytope in the units of x; None: no limits.
-        inputs: Box or Polytope in the units of u; None: no limits.
+        states: Box or Polytope in the units of x; None: no limits. Its arrays may have a leading
+            axis, an entry for each k at which it holds: lower (N, n), H (N, rows, n) and so on.
+        inputs: Box or Polytope in the units of u; None: no limits. Its arrays may have a leading
+            axis of N steps.
         terminal_cost: P (n, n) ⪰ 0 or its diagonal; None: no terminal cost.
         terminal_set: Box, Polytope or Ellipsoid that holds x_N; None: x_N is free.
         constrain_initial: whether `states` hold at k = 0, which no input moves.
@@ -179,9 +204,10 @@ class MPC:
         input_rate_weight: W (m, m) or its diagonal (m,), or a number for one input, or (N, m, m):
             adds Σ Δu_k'W Δu_k with Δu_k = u_k − u_{k−1}.
         input_rate_limit: |Δu_k| ≤ limit, (m,) or a number, or Δu_k in a Box; in the units of u for
-            each time step. With it, or a weight of rates, the previous input u_{−1} is part of the
-            state of the controller: `solve(..., previous_input=)`; in sweeps the states are
-            (x, u_{−1}), n + m in all, if there is a limit.
+            each time step; with a leading axis, (N, m), one for each step. With it, or a weight of
+            rates, the previous input u_{−1} is part of the state of the controller:
+            `solve(..., previous_input=)`; in sweeps the states are (x, u_{−1}), n + m in all, if
+            there is a limit.
         stage_weights: s (N,) ≥ 0 weighs the stages, Σ s_k (x_k'Q x_k + u_k'R u_k); None: all 1.
         disturbance: W, a bounded Box, Polytope or Zonotope that holds the origin: the plant is
             x⁺ = A x + B u + c + E w, and all rows, the terminal set and soft rows too, are kept for
@@ -307,6 +333,9 @@ class MPC:
     def validate(self) -> None:
         """Raise ValueError that names the field, its value and the cure, before any compile."""
         self.require_sizes()
+        if not isinstance(self.constrain_initial, bool | np.bool_):
+            fail("constrain_initial", f"{self.constrain_initial!r}", "Give True or False")
+        self._validate_stages()
         n, m = self.system.n, self.system.m
         self._require_weight("Q", n, "Q weighs the states: one row for each")
         self._require_weight("R", m, "R weighs the inputs: one row for each")
@@ -318,33 +347,37 @@ class MPC:
             require_shape("stage_weights", s, (N,), "One number for each k = 0..N−1")
             if concrete(s) and not (np.all(np.isfinite(s)) and np.all(np.asarray(s) >= 0)):
                 fail("stage_weights", f"{np.asarray(s).tolist()}", "Give numbers of at least 0")
-        for name, kinds, size in (
-            ("states", (Box, Polytope), n),
-            ("inputs", (Box, Polytope), m),
-            ("terminal_set", (Box, Polytope, Ellipsoid), n),
-        ):
+        sets: tuple[tuple[str, tuple[type, ...], int, tuple[int, ...] | None], ...] = (
+            ("states", (Box, Polytope), n, self.state_stages),
+            ("inputs", (Box, Polytope), m, tuple(range(self.horizon))),
+            ("terminal_set", (Box, Polytope, Ellipsoid), n, None),
+        )
+        for name, kinds, size, stages in sets:
             value = getattr(self, name)
             if value is None:
                 continue
             if not isinstance(value, kinds):
                 wanted = " or ".join(kind.__name__ for kind in kinds)
                 fail(name, f"is a {type(value).__name__}", f"Give a {wanted}, or None")
-            value.validate(name, size)
+            for where, part in _stage_by_stage(name, value, stages):
+                part.validate(where, size)
             if isinstance(value, Ellipsoid):
                 value.require_origin(name)
         if not isinstance(self.prestabilise, Switch | None):
             K = self.prestabilise
             if np.shape(K) != (self.horizon, m, n):
                 require_shape("prestabilise", K, (m, n), "A gain K with u = Kx + v, or N of them")
-        if not isinstance(self.constrain_initial, bool | np.bool_):
-            fail("constrain_initial", f"{self.constrain_initial!r}", "Give True or False")
-        self._validate_stages()
         for i, soft in enumerate(as_tuple("soft", self.soft, Soft)):
             self._validate_rows(f"soft[{i}]", soft)
             for what, weight in (("rho", soft.rho), ("quadratic", soft.quadratic)):
                 name = f"soft[{i}].{what}"
                 require_real(name, weight)
-                if np.shape(as_array(weight)) not in ((), np.shape(soft.sides[0])):
+                rows = np.shape(as_array(soft.C))[-2]
+                if np.shape(as_array(weight)) not in (
+                    (),
+                    (rows,),
+                    (len(soft_stages(self, soft)), rows),
+                ):
                     fail(name, f"shape {np.shape(as_array(weight))}", "One number, or one a row")
                 require_finite(name, weight)
                 if concrete(weight) and np.any(np.asarray(weight) < 0):
@@ -365,7 +398,7 @@ class MPC:
 
     @property
     def varying(self) -> tuple[str, ...]:
-        """Names of the data that differ from step to step: "system.A", "Q" and so on."""
+        """Names of the data that differ from step to step: "system.A", "Q", "states" and so on."""
         system = self.system
         matrices = {
             "system.A": system.A,
@@ -375,16 +408,27 @@ class MPC:
             "input_rate_weight": self.input_rate_weight,
         }
         found = [name for name, value in matrices.items() if dimensions(value) == 3]
-        return (*found, *(["system.c"] if dimensions(system.c) == 2 else []))
+        found += ["system.c"] if dimensions(system.c) == 2 else []
+        for name in ("states", "inputs", "outputs", "soft", "input_rate_limit"):
+            value = getattr(self, name)
+            parts = value if isinstance(value, tuple) else (value,)
+            if any(map(differing, parts)) or dimensions(value) == 2:
+                found.append(name)
+        return tuple(found)
+
+    def differs(self, *names: str) -> str | None:
+        """Return the first name of `varying` that is one of these, or of a part of one; None for
+        none. names: none stands for all."""
+        own = (name for name in self.varying if not names or {name, name.split(".")[0]} & {*names})
+        return next(own, None)
 
     def require_constant(self, what: str, *names: str) -> None:
-        """Raise ValueError where data differ from step to step that must not in `what`.
-
-        names: of these, or of what they are a part of; none: all data."""
-        for name in self.varying:
-            if not names or name in names or name.split(".")[0] in names:
-                cure = "Give the same at all steps: leave the leading axis out"
-                fail(name, f"differs from step to step, and {what}", cure)
+        """Raise ValueError where data differ from step to step, and say why they must not; names:
+        as in `differs`."""
+        name = self.differs(*names)
+        if name is not None:
+            cure = "Give the same at all steps: leave the leading axis out"
+            fail(name, f"differs from step to step, and {what}", cure)
 
     def _require_weight(self, name: str, size: int, cure: str) -> None:
         """Raise ValueError unless a weight is a matrix, or one for each step, and none is
@@ -424,6 +468,14 @@ class MPC:
             fail("control_horizon", f"{blocks} moves in {N} steps", f"Give at most {N}")
 
     def _validate_rows(self, name: str, rows: Soft | Outputs) -> None:
+        """Raise ValueError unless rows have the sizes of the problem, at each of their stages."""
+        last = self.horizon - (rows.D is not None)
+        _require_stages(f"{name}.stages", rows.stages, last)
+        find: Any = soft_stages if isinstance(rows, Soft) else output_stages
+        for where, part in _stage_by_stage(name, rows, find(self, rows)):
+            self._validate_rows_at(where, part)
+
+    def _validate_rows_at(self, name: str, rows: Soft | Outputs) -> None:
         n, m = self.system.n, self.system.m
         require_real(f"{name}.C", rows.C)
         shape = np.shape(as_array(rows.C))
@@ -451,8 +503,6 @@ class MPC:
                 fail(f"{name}.{what}", f"{given!r}", "Give a tuple of strings")
             if len(given) not in (0, p):
                 fail(f"{name}.{what}", f"{len(given)} for {p} rows", "All or none")
-        last = self.horizon - (rows.D is not None)
-        _require_stages(f"{name}.stages", rows.stages, last)
 
     def _validate_rates(self) -> None:
         m, W, limit = self.system.m, self.input_rate_weight, self.input_rate_limit
@@ -462,11 +512,12 @@ class MPC:
                 fail("input_rate_weight", f"shape {np.shape(W)}", f"Give ({m}, {m}) or ({m},)")
             self._require_weight("input_rate_weight", m, "One row for each input")
         if isinstance(limit, Box):
-            limit.validate("input_rate_limit", m)
+            for where, part in _stage_by_stage("input_rate_limit", limit, range(self.horizon)):
+                part.validate(where, m)
         elif limit is not None:
             if concrete(limit):
                 host_array("input_rate_limit", limit)
-            if np.shape(limit) not in ((), (m,)):
+            if np.shape(limit) not in ((), (m,), (self.horizon, m)):
                 fail("input_rate_limit", f"shape {np.shape(limit)}", f"Give ({m},) or a Box")
             if concrete(limit) and not np.all(np.asarray(limit, float) >= 0):
                 fail("input_rate_limit", f"{limit}", "|Δu| ≤ limit needs limit ≥ 0 (inf: none)")
@@ -480,7 +531,7 @@ class MPC:
                 if getattr(self, name) is not None:
                     fail(name, "given without a disturbance", "Give disturbance=jm.Box(…) too")
             return
-        self.require_constant("policies against a disturbance know one for all", "system")
+        self.require_constant("policies against a disturbance know one for all", *HARD, "soft")
         if self.gain is None and self.policy != "affine":
             self.require_constant("no LQR belongs to it: a disturbance needs a gain then", "Q", "R")
         if self.disturbance_matrix is not None:
@@ -602,6 +653,31 @@ def _require_stages(name: str, stages: Any, last: int) -> None:
         fail(name, f"{stages!r}", f"Give a tuple of different stages from 0 to {last}")
 
 
+def _stage_by_stage(
+    name: str, part: Any, stages: Sequence[int] | None
+) -> Iterator[tuple[str, Any]]:
+    """Yield a set, or rows, with the name for errors: at each of its stages where it differs from
+    one to the next (what is traced at the first alone, for its shapes), else once. stages: None for
+    a set that may not differ. Raises ValueError for a leading axis of another length."""
+    names = differing(part) if stages is not None else ()
+    if stages is None or not names:
+        yield name, part
+        return
+    for field in names:
+        shape = np.shape(as_array(getattr(part, field)))
+        if shape[0] != len(stages):
+            cure = f"A leading axis counts the {len(stages)} stages at which they hold"
+            fail(f"{name}.{field}", f"shape {shape}", cure)
+    for j, k in enumerate(stages if concrete(part) else stages[:1]):
+        yield f"{name} at k = {k}", at_stage(part, j)
+
+
+def soft_stages(mpc: MPC, rows: Soft) -> tuple[int, ...]:
+    """The k at which soft rows hold."""
+    every = tuple(range(mpc.horizon + (rows.D is None)))
+    return every if rows.stages is None else rows.stages
+
+
 def output_stages(mpc: MPC, rows: Outputs) -> tuple[int, ...]:
     """The k at which output limits hold."""
     if rows.stages is not None:
@@ -638,10 +714,10 @@ def soften(mpc: MPC, rho: Reals, quadratic: Reals = 0.0) -> MPC:
             names, units = mpc.system.state_names, mpc.system.state_units
             if isinstance(limits, Polytope):
                 names, units = limits.labels, ()
-            names = names or _numbered(kind, np.size(lower))
+            names = names or _numbered(kind, np.shape(lower)[-1])
             hard.append(Outputs(C, lower, upper, None, stages, names, units))
     for rows in as_tuple("outputs", mpc.outputs, Outputs):
-        names = rows.names or _numbered("output", np.size(rows.sides[0]))
+        names = rows.names or _numbered("output", np.shape(rows.sides[0])[-1])
         hard.append(replace(rows, stages=output_stages(mpc, rows), names=names))
     soft = list(as_tuple("soft", mpc.soft, Soft))
     for rows in filter(None, map(_with_limits, hard)):
@@ -665,14 +741,16 @@ def _with_limits(rows: Outputs) -> Outputs | None:
         return rows if rows.stages else None
     lower, upper = rows.sides
     bounded = np.isfinite(lower) | np.isfinite(upper)
-    keep = lambda v: np.asarray(v)[bounded]
+    bounded = bounded.reshape(-1, bounded.shape[-1]).any(axis=0)
+    keep = lambda v: np.asarray(v)[..., bounded]
+    of_rows = lambda M: np.asarray(M)[..., bounded, :]
     text = lambda v: tuple(str(part) for part in keep(v)) if v else ()
     limited = replace(
         rows,
-        C=keep(rows.C),
+        C=of_rows(rows.C),
         lower=keep(lower),
         upper=keep(upper),
-        D=None if rows.D is None else keep(rows.D),
+        D=None if rows.D is None else of_rows(rows.D),
         names=text(rows.names),
         units=text(rows.units),
     )
@@ -688,8 +766,11 @@ def harden(mpc: MPC) -> MPC:
     N, every = mpc.horizon, mpc.state_stages
     states, terminal, outputs = [], [], list(as_tuple("outputs", mpc.outputs, Outputs))
     for s in as_tuple("soft", mpc.soft, Soft):
-        steps = tuple(range(N + (s.D is None))) if s.stages is None else s.stages
+        steps = soft_stages(mpc, s)
         lower, upper = s.sides
+        if differing(replace(s, rho=0.0, quadratic=0.0)):
+            outputs.append(Outputs(s.C, lower, upper, s.D, steps, s.names, s.units))
+            continue
         rows = Polytope(s.C, upper, s.names)
         if s.lower is not None:
             rows = output_limits(s.C, lower, upper, s.names, s.units)

@@ -19,7 +19,7 @@ from jax import Array
 from jax.typing import DTypeLike
 
 from jaxmpc.checks import require_kind
-from jaxmpc.mpc.problem import MPC, Outputs, Soft, output_stages
+from jaxmpc.mpc.problem import MPC, Outputs, Soft, output_stages, soft_stages
 from jaxmpc.mpc.tightening import tightened
 from jaxmpc.pytrees import pytree, record, static
 from jaxmpc.qp.linalg import apply, apply_transposed, cholesky, matmul
@@ -101,9 +101,10 @@ class Block(Rows):
     """lower ≤ H x_k + D v_k ≤ upper, lower and upper (r,), or (steps, r) where they differ from
     step to step.
 
-    names, units: of the rows. rate: v_k is Δu_k. linear, quadratic (r,): weights c and k of the
-    penalty c e + ½ k e² of a violation e where the rows are soft (k is twice `Soft.quadratic`),
-    None where they are hard. radius: the rows are those of a ball |H x| ≤ radius.
+    names, units: of the rows. rate: v_k is Δu_k. linear, quadratic (r,), or (steps, r): weights c
+    and k of the penalty c e + ½ k e² of a violation e where the rows are soft (k is twice
+    `Soft.quadratic`), None where they are hard. radius: the rows are those of a ball |H x| ≤
+    radius.
     """
 
     lower: Any
@@ -182,7 +183,7 @@ def given_blocks(mpc: MPC, dtype: DTypeLike) -> list[Block]:
         **more: Any,
     ) -> None:
         H, D = (None if M is None else cast(M) for M in (H, D))
-        r = (H if D is None else D).shape[0]
+        r = (H if D is None else D).shape[-2]
         names, units = texts
         names = tuple(names) or tuple(f"{kind} row {i + 1}" for i in range(r))
         units = tuple(units) or ("",) * r
@@ -205,17 +206,19 @@ def given_blocks(mpc: MPC, dtype: DTypeLike) -> list[Block]:
     if mpc.rate_limited:
         limit: Any = mpc.input_rate_limit
         if not isinstance(limit, Box):
-            limit = Box(-jnp.broadcast_to(cast(limit), (m,)), jnp.broadcast_to(cast(limit), (m,)))
+            limit = cast(limit)
+            limit = jnp.broadcast_to(limit, (m,)) if limit.ndim < 2 else limit
+            limit = Box(-limit, limit)
         names = tuple(f"rate of {name}" for name in input_names)
         texts = names, tuple(f"{unit}/step" for unit in system.input_units)
         D, *sides = limit.rows()
         add("rate", None, D, tuple(sides), range(N), texts, rate=True, box=True)
     for soft in (mpc.soft,) if isinstance(mpc.soft, Soft) else mpc.soft:
-        every = tuple(range(N + (soft.D is None)))
-        stages = every if soft.stages is None else soft.stages
-        p = np.shape(soft.sides[0])
-        linear = jnp.broadcast_to(cast(soft.rho), p)
-        quadratic = 2 * jnp.broadcast_to(cast(soft.quadratic), p)
+        stages, p = soft_stages(mpc, soft), np.shape(soft.C)[-2:-1]
+        linear, quadratic = cast(soft.rho), 2 * cast(soft.quadratic)
+        linear, quadratic = (
+            v if v.ndim == 2 else jnp.broadcast_to(v, p) for v in (linear, quadratic)
+        )
         texts = soft.names, soft.units
         more: dict[str, Any] = {"linear": linear, "quadratic": quadratic}
         add("soft", soft.C, soft.D, soft.sides, stages, texts, **more)

@@ -12,7 +12,7 @@ from scipy.optimize import lsq_linear
 
 from jaxmpc.arrays import Reals, host_array
 from jaxmpc.checks import fail, require_finite, require_shape
-from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.problem import HARD, MPC
 from jaxmpc.mpc.rows import Block, blocks, joined_bounds
 from jaxmpc.pytrees import named_pytree, pytree, static
 from jaxmpc.qp.admm import ADMM, Factor, factorise
@@ -135,6 +135,7 @@ class SteadyStates:
         """Return the steady states of a problem for outputs (q, n), whose errors are measured in
         these units (q,). system: its model, with values that can be read; limits may be traced.
         Raises ValueError where the inputs do not hold every load."""
+        mpc.require_constant("a steady state has one for all", *HARD, "soft")
         A, B, c = host_matrices(system)
         n, m = B.shape
         M = np.hstack([np.eye(n) - A, -B])

@@ -21,12 +21,12 @@ import numpy as np
 
 from jaxmpc.arrays import Reals, host_array
 from jaxmpc.batches import default_chunk
-from jaxmpc.checks import fail, whole
+from jaxmpc.checks import fail, require_kind, whole
 from jaxmpc.explicit.law_at_states import Law, RegionLaw
 from jaxmpc.feasible.plan_polytope import CenteredPolytope
 from jaxmpc.feasible.policy_problem import problem_of
 from jaxmpc.grids import grid
-from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.problem import HARD, MPC
 from jaxmpc.recursion.counterexamples import (
     STARTS,
     Counterexample,
@@ -52,6 +52,8 @@ from jaxmpc.recursion.report import RecursionReport, SmallestHorizon
 from jaxmpc.recursion.time_budget import LABELS, PLANS, PROOFS, Budget
 
 # Where to look for lost states beside a worst vertex: so far towards the centre.
+# Of data that differ from step to step.
+SAME = "recursive feasibility is about the same problem at every time step"
 NEAR_THE_WORST = np.array([1e-6, 1e-4, 1e-3, 1e-2])
 
 
@@ -122,6 +124,8 @@ def examine(
     settled: float,
 ) -> RecursionReport:
     """Return the report of `recursive_feasibility`; settled: when its stage 1 has to end."""
+    require_kind("mpc", mpc, MPC)
+    mpc.require_constant(SAME, *HARD)
     problem = problem_of(mpc)
     p = problem.dimension
     steps, max_regions = whole("steps", steps, 1), whole("max_regions", max_regions, 0)
@@ -306,6 +310,7 @@ def smallest_horizon(
     free moves than steps) is left out of it. Raises ValueError for an ill-posed problem.
     """
     mpc.validate()
+    mpc.require_constant(SAME, *HARD)
     max_horizon = whole("max_horizon", max_horizon, 1)
     max_regions = whole("max_regions", max_regions, 0)
     least: int | None = None

@@ -128,6 +128,7 @@ class RobotSetting:
         if claim not in CLAIMS:
             fail("claim", f"{claim!r}", f"Give one of {', '.join(CLAIMS)}")
         mpc.validate()
+        mpc.require_constant("the loops of a robot have the same problem at every time step")
         if (mpc.system.n, mpc.system.m) != (robot.n, robot.m):
             sizes, needed = (mpc.system.n, mpc.system.m), (robot.n, robot.m)
             fail("mpc", f"has {sizes} states and inputs", f"This robot has {needed}: see robot_mpc")

@@ -144,6 +144,7 @@ def weight_parameters(
     is at most TIGHTEST and leaves the target (n,) inside. Raises ValueError for a weight that is
     not positive definite, and for what the problem does not have.
     """
+    mpc.require_constant("jm.tuning.MPCLayer alone learns it", "Q", "R")
     found: dict[str, Parameter] = {}
     for name, value in (("Q", mpc.Q), ("R", mpc.R), ("P", mpc.terminal_cost)):
         if name not in tune:
@@ -196,6 +197,7 @@ def linear_task(
     ones. limits: of the states, where those of the problem are tightened ones. validation: fraction
     of the initial states x0s (B, n). terms: of `weight_loss`.
     """
+    mpc.require_constant("closed loops have the same problem at every time step")
     limits = mpc.states if limits is None else limits
     n, inputs = mpc.system.n, mpc.inputs
     assert isinstance(inputs, Box)

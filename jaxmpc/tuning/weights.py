@@ -191,6 +191,7 @@ class _Loops:
 def _default_loss(controller: Any, plant: Any, r: Any, s: Any) -> ClosedLoopLoss:
     """Return the loss with the weights and state limits of a controller's problem."""
     mpc, limits = controller.mpc, controller.limits
+    mpc.require_constant("no loss follows from it: give a loss", "Q", "R")
     if limits is None and mpc.soft:
         limits = harden(mpc).states
     plant = plant if hasattr(plant, "coordinates") else None

@@ -20,7 +20,7 @@ from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.grids import grid
 from jaxmpc.mpc.condense import condensed_in_float64, in_float64
 from jaxmpc.mpc.controller import Controller
-from jaxmpc.mpc.problem import MPC, harden
+from jaxmpc.mpc.problem import HARD, MPC, harden
 from jaxmpc.mpc.rows import row_table
 from jaxmpc.mpc.tightening import feedback_gain
 from jaxmpc.pytrees import record
@@ -175,6 +175,7 @@ def offline_report(
     require_kind("mpc", mpc, MPC)
     budget = Budget.of(seconds, progress)
     mpc.validate()
+    mpc.require_constant("the report is about the same problem at every time step", *HARD)
     for name, value, least in (("steps", steps, 2), ("loops", loops, 1)):
         whole(name, value, least)
     hard = harden(mpc)

@@ -219,7 +219,9 @@ def within_reason(
     most = rest_u
     if isinstance(problem.mpc.inputs, Box):
         ends = arrays((problem.mpc.inputs.lower, problem.mpc.inputs.upper))
-        sizes = jnp.stack([jnp.abs(jnp.asarray(v, u.dtype)) for v in ends])
+        sizes = jnp.stack(
+            [jnp.abs(jnp.broadcast_to(jnp.asarray(v, u.dtype), u.shape)) for v in ends]
+        )
         most = jnp.max(jnp.where(jnp.isfinite(sizes), sizes, 0.0), axis=0) + jnp.abs(rest_u)
     still = jnp.broadcast_to(x[:1], x.shape)
     x, rest_x, most_x = (base.joined(x, u), base.joined(still, rest_u), base.joined(still, most))
