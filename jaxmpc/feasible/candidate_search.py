@@ -47,9 +47,9 @@ def inputs_of(p: ExactData, rows: ConstraintRows, theta: Array, w: Array) -> tup
 def cut_of(p: ExactData, rows: ConstraintRows, y: Array) -> proofs.Cut:
     """Return the `proofs.cut` that follows from multipliers y (R,) of the rows."""
     y = jnp.append(y * rows.weight, 0.0)[jnp.asarray(rows.index)]
-    staged, last = p.horizon * p.H.shape[0], p.H_N.shape[0]
+    staged, last = p.lower.size, p.H_N.shape[0]
     y_states, y_N, y_ball = jnp.split(y, [staged, staged + last])
-    return proofs.cut(p, y_states.reshape(p.horizon, p.H.shape[0]), y_N, y_ball)
+    return proofs.cut(p, y_states.reshape(p.lower.shape), y_N, y_ball)
 
 
 def with_violated_limit(rows: ConstraintRows, theta: Array, y: Array) -> Array:

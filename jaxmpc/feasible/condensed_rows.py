@@ -14,7 +14,7 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.checks import fail
-from jaxmpc.feasible.hard_constraints import View, absorbed
+from jaxmpc.feasible.hard_constraints import View, absorbed, around
 from jaxmpc.mpc.problem import MPC, RELAX
 from jaxmpc.mpc.rows import Block
 from jaxmpc.pytrees import pytree, static
@@ -93,7 +93,7 @@ def constraint_rows(
     # Inputs and free states in units of their limits, relative to the first input's: the variables
     # count alike.
     firsts = np.unique(mpc.moves, return_index=True)[1]
-    sides = np.abs(set_bounds(mpc.inputs, mpc.system.m)).max(axis=0)
+    sides = np.abs(set_bounds(around(mpc.inputs), mpc.system.m)).max(axis=0)
     unit = np.tile(power_of_two(sides), len(firsts))
     if extra:
         free = power_of_two(np.maximum(np.abs(view.lower), np.abs(view.upper)))

@@ -15,7 +15,7 @@ from jax import Array
 
 from jaxmpc.arrays import Reals
 from jaxmpc.checks import fail, require_finite, require_shape
-from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.problem import MPC, at_stage, differing
 from jaxmpc.mpc.rows import Block, given_blocks
 from jaxmpc.mpc.tightening import require_room, require_tightened, with_bounds
 from jaxmpc.pytrees import named_pytree, pytree, static
@@ -88,7 +88,7 @@ def make_view(mpc: MPC, axes: Axes = None, fixed: Reals | None = None) -> View:
     constrained = others and 0 in mpc.state_stages
     sides = set_bounds(mpc.states if constrained else None, mpc.system.n)
     if n > mpc.system.n:  # a previous input is one that could be applied
-        limits = set_bounds(mpc.inputs, mpc.system.m)
+        limits = set_bounds(at_stage(mpc.inputs, 0), mpc.system.m)
         sides = (np.append(sides[0], limits[0]), np.append(sides[1], limits[1]))
     lower, upper = sides
     return View(axes, others, None, lower[list(others)], upper[list(others)])
@@ -108,18 +108,19 @@ class Sides(NamedTuple):
 class ExactData:
     """The hard constraints of an MPC problem as float64 arrays: exact data for proofs.
 
-    lower_k ≤ H x_k + D u_k ≤ upper_k for k < N: H (r, n), D (r, m), lower and upper (N, r), ±inf at
-    steps where a row does not hold. lower_N ≤ H_N x_N ≤ upper_N. widest: the same four bounds no
-    narrower than they are exactly, for half-spaces, where the others are no wider, for plans: of a
-    robust problem they are sums that are rounded; else they are the same arrays. P, level: terminal
-    ellipsoid x'Px ≤ level, None without; back (n, rows) leads from multipliers of its rows L'x to
-    v. u_lower, u_upper (N, m): a box around the inputs; move_lower, move_upper (moves, m): the
-    part of it, at its widest, that limits on the states leave to each free move. left (N, n): 1
-    where errors of the costates p_k, k = 1..N, are passed to the step before (side and reach are 0
-    there), else 0, with |x_k| + side∘x_k ≤ reach on every feasible trajectory. side_0, reach_0
-    (d,): the same for every
-    feasible θ, ∞ where nothing bounds it. equalities: how inputs keep equalities, None where there
-    are none, or none that inputs can keep. moves: index of the free move that each input equals.
+    x_{k+1} = A x_k + B u_k + c. lower_k ≤ H x_k + D u_k ≤ upper_k for k < N: H (r, n), D (r, m),
+    lower and upper (N, r), ±inf at steps where a row does not hold. A, B, c, H and D have a leading
+    axis of N where they differ from step to step. lower_N ≤ H_N x_N ≤ upper_N. widest: the same
+    four bounds no narrower than they are exactly, for half-spaces, where the others are no wider,
+    for plans: of a robust problem they are sums that are rounded; else they are the same arrays. P,
+    level: terminal ellipsoid x'Px ≤ level, None without; back (n, rows) leads from multipliers of
+    its rows L'x to v. u_lower, u_upper (N, m): a box around the inputs; move_lower, move_upper
+    (moves, m): the part of it, at its widest, that limits on the states leave to each free move.
+    left (N, n): 1 where errors of the costates p_k, k = 1..N, are passed to the step before (side
+    and reach are 0 there), else 0, with |x_k| + side∘x_k ≤ reach on every feasible trajectory.
+    side_0, reach_0 (d,): the same for every feasible θ, ∞ where nothing bounds it. equalities: how
+    inputs keep equalities, None where there are none, or none that inputs can keep. moves: index of
+    the free move that each input equals.
     """
 
     A: np.ndarray
@@ -154,6 +155,21 @@ class ExactData:
         """Return the horizon N."""
         return len(self.moves)
 
+    @property
+    def sizes(self) -> tuple[int, int]:
+        """Return the numbers of states and of inputs."""
+        n, m = np.shape(self.B)[-2:]
+        return n, m
+
+    @property
+    def stepwise(self) -> tuple[tuple[Any, int], ...]:
+        """Return A, B, c, H and D, each with the number of axes that it has at one step."""
+        return (self.A, 2), (self.B, 2), (self.c, 1), (self.H, 2), (self.D, 2)
+
+    def at(self, k: int) -> list[Any]:
+        """Return A, B, c, H and D at step k."""
+        return [v[k] if np.ndim(v) > axes else v for v, axes in self.stepwise]
+
 
 @pytree
 class Equalities:
@@ -180,7 +196,7 @@ class Equalities:
         X = E⁺ and η = ‖ |I − E X| + e|X| ‖ < 1 in the maximum norm, exactly E X is invertible, and
         X (E X)⁻¹ r is an exact change, no larger than |X| ‖r‖ / (1 − η).
         """
-        (n, m), N = np.shape(p.B), p.horizon
+        (n, m), N = p.sizes, p.horizon
         moves = np.equal.outer(np.array(p.moves), np.arange(max(p.moves) + 1)).astype(float)
         first = np.unique(p.moves, return_index=True)[1]
         free = np.ravel((p.u_lower < p.u_upper)[first])
@@ -188,7 +204,8 @@ class Equalities:
         unit = 2.0**-52 * (n + m + 4)
         values, errors, at, at_N = [], [], p.lower == p.upper, p.lower_N == p.upper_N
         for k in range(N + 1):
-            H, D, found = (p.H, p.D, at[k]) if k < N else (p.H_N, np.zeros((len(at_N), m)), at_N)
+            A, B, _, H, D = p.at(min(k, N - 1))
+            H, D, found = (H, D, at[k]) if k < N else (p.H_N, np.zeros((len(at_N), m)), at_N)
             # u_k from all moves.
             u = np.kron(moves[k], np.eye(m)) if k < N else np.zeros((m, free.size))
             value = (H @ gain + D @ u) * free
@@ -198,8 +215,8 @@ class Equalities:
             values.append(value[found])
             errors.append(size[found] * free)
             if k < N:
-                off = np.abs(p.A) @ (off + unit * np.abs(gain)) + unit * np.abs(p.B) @ u
-                gain = p.A @ gain + p.B @ u
+                off = np.abs(A) @ (off + unit * np.abs(gain)) + unit * np.abs(B) @ u
+                gain = A @ gain + B @ u
         E, e = np.concatenate(values), np.concatenate(errors)
         if not len(E):
             return None
@@ -223,11 +240,11 @@ def rounding_of_rows(p: ExactData, start: np.ndarray) -> tuple[np.ndarray, np.nd
     from |x_0| ≤ start (n,): rows of the stages (N, r), of the last state (r_N,), and of L'x_N."""
     u = largest_magnitude(p.move_lower, p.move_upper)[list(p.moves)]
     u = np.where(np.isfinite(u), u, 0.0)
-    A, B, H, D = (np.abs(v) for v in (p.A, p.B, p.H, p.D))
     x, error, stages = start, np.zeros_like(start), []
     for k in range(p.horizon):
+        A, B, c, H, D = map(np.abs, p.at(k))
         stages.append(H @ (error + x) + D @ u[k])
-        bound = A @ x + B @ u[k] + np.abs(p.c)
+        bound = A @ x + B @ u[k] + c
         error = A @ error + bound
         x = np.where(p.left[k] == 0, np.minimum(bound, p.reach[k]), bound)
     ball = np.zeros(0) if p.P is None else np.linalg.norm(np.linalg.pinv(p.back), axis=1)
@@ -235,12 +252,14 @@ def rounding_of_rows(p: ExactData, start: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def augmented_dynamics(mpc: MPC) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return A, B, c of x⁺ = Ax + Bu + c, for (x, u_{−1}) where input rates are limited."""
-    n, m = mpc.system.n, mpc.system.m
-    A, B, c = host_matrices(mpc.system)
+    """Return A, B, c of x⁺ = Ax + Bu + c, for (x, u_{−1}) where input rates are limited, each with
+    a leading axis where it differs from step to step."""
+    m = mpc.system.m
+    A, B, c = host_matrices(mpc.system, by_step=True)
     if mpc.rate_limited:
-        A = np.block([[A, np.zeros((n, m))], [np.zeros((m, n + m))]])
-        B, c = np.concatenate([B, np.eye(m)]), np.concatenate([c, np.zeros(m)])
+        more = lambda v, axes: np.pad(v, [(0, 0)] * (v.ndim - axes) + [(0, m)] * axes)
+        identity = np.broadcast_to(np.eye(m), (*B.shape[:-2], m, m))
+        A, B, c = more(A, 2), np.concatenate([B, identity], axis=-2), more(c, 1)
     return A, B, c
 
 
@@ -259,13 +278,15 @@ def hard_blocks(mpc: MPC, *, widest: bool = False) -> list[Block]:
     n, m, p = mpc.system.n, mpc.system.m, mpc.dimension
     hard = previous_inputs(mpc)
     for b in found:
-        H = np.zeros((b.size, p))
         D = np.zeros((b.size, m)) if b.D is None else np.asarray(b.D, np.float64)
+        of_states = np.zeros((b.size, n)) if b.H is None else np.asarray(b.H, np.float64)
+        H = np.zeros((*of_states.shape[:-1], p))
+        H[..., :n] = of_states
         if b.rate:
-            H[:, n:] = -D
-        elif b.H is not None:
-            H[:, :n] = b.H
+            H[..., n:] = -D
         lower, upper = np.asarray(b.lower, np.float64), np.asarray(b.upper, np.float64)
+        if lower.ndim != upper.ndim:
+            lower, upper = np.broadcast_arrays(lower, upper)
         hard.append(replace(b, H=H, D=D, lower=lower, upper=upper))
     return hard
 
@@ -276,9 +297,10 @@ def previous_inputs(mpc: MPC) -> list[Block]:
     if not mpc.rate_limited or mpc.inputs is None:
         return []
     n, m = mpc.system.n, mpc.system.m
-    H, lower, upper = (np.asarray(v, np.float64) for v in mpc.inputs.rows())
+    inputs = at_stage(mpc.inputs, 0)
+    H, lower, upper = (np.asarray(v, np.float64) for v in inputs.rows())
     names = tuple(f"previous input row {i + 1}" for i in range(len(lower)))
-    if isinstance(mpc.inputs, Box):
+    if isinstance(inputs, Box):
         names = tuple(f"previous {label}" for label in mpc.system.input_labels)
     H = np.hstack([np.zeros((len(H), n)), H])
     D = np.zeros((len(H), m))
@@ -308,8 +330,9 @@ def exact_data(
     """
     n, m, N = mpc.system.n, mpc.system.m, mpc.horizon
     A, B, c = augmented_dynamics(mpc)
+    each_step = [np.broadcast_to(v, (N, *v.shape[-axes:])) for v, axes in ((A, 2), (B, 2), (c, 1))]
     limits = limits_of_states(mpc)
-    u_lower, u_upper = set_bounds(mpc.inputs, m)
+    u_lower, u_upper = set_bounds(around(mpc.inputs), m)
 
     extent = np.asarray(extent) if np.ndim(extent) == 2 else np.array([-extent, extent])
     first = limits[0][:, list(view.axes)]
@@ -317,16 +340,17 @@ def exact_data(
     grown = start_sizes(view, reach_0 if size is None else size)
     u_size = largest_magnitude(u_lower, u_upper)
     left, sides, reach = np.zeros((3, N, mpc.dimension))
-    for k in range(N):
+    for k, (A_k, B_k, c_k) in enumerate(zip(*each_step, strict=True)):
         with np.errstate(invalid="ignore"):  # 0·inf below counts as 0
-            grown = np.nansum(np.abs(A) * grown, axis=1) + np.abs(c)
-            grown = grown + np.nansum(np.abs(B) * u_size, axis=1)
+            grown = np.nansum(np.abs(A_k) * grown, axis=1) + np.abs(c_k)
+            grown = grown + np.nansum(np.abs(B_k) * u_size, axis=1)
         side, bound = one_sided(*limits[k + 1])
         far = (bound > grown) | np.isinf(bound)
         left[k], sides[k], reach[k] = far, np.where(far, 0.0, side), np.where(far, 0.0, bound)
         grown = np.minimum(grown, bound)
     x_size = [largest_magnitude(*limit[:, :n]) for limit in limits]
-    implied = input_size(A[:n, :n], B[:n], c[:n], x_size)
+    ends = zip(*(v[:, :n] for v in each_step), itertools.pairwise(x_size), strict=True)
+    implied = np.array([input_size(A_k[:, :n], B_k, c_k, *two) for A_k, B_k, c_k, two in ends])
     same_move = [np.equal(mpc.moves, i) for i in range(max(mpc.moves) + 1)]
     implied = np.array([implied[same].min(axis=0) for same in same_move])
     widest = blocks if widest is None else widest
@@ -383,14 +407,32 @@ def staged_rows(mpc: MPC, blocks: list[Block]) -> list[np.ndarray]:
     upper_N = [b.at_steps(b.upper, N + 1, np.inf)[N] for b in last]
     none = np.zeros((0, p)), np.zeros((0, mpc.system.m)), np.zeros((N, 0)), np.zeros(0)
     return [
-        np.concatenate([none[0], *(b.H for b in staged)]),
-        np.concatenate([none[1], *(b.D for b in staged)]),
+        stacked_steps([none[0], *(b.H for b in staged)], [(), *(b.steps for b in staged)], N),
+        stacked_steps([none[1], *(b.D for b in staged)], [(), *(b.steps for b in staged)], N),
         np.concatenate([none[2], *(side[:N] for side in lower)], axis=1),
         np.concatenate([none[2], *(side[:N] for side in upper)], axis=1),
-        np.concatenate([none[0], *(b.H for b in last)]),
+        np.concatenate([none[0], *(at_last(b.H, b.steps, N) for b in last)]),
         np.concatenate([none[3], *lower_N]),
         np.concatenate([none[3], *upper_N]),
     ]
+
+
+def stacked_steps(parts: list[np.ndarray], steps: list[tuple[int, ...]], N: int) -> np.ndarray:
+    """Return matrices below each other, (r, n), or (N, r, n) where one of them differs from step to
+    step, which is zero at steps k < N where it does not hold."""
+    if all(M.ndim == 2 for M in parts):
+        return np.concatenate(parts)
+    filled = []
+    for M, at in zip(parts, steps, strict=True):
+        every = np.zeros((N + 1, *M.shape[-2:]))
+        every[list(at) if M.ndim == 3 else slice(None)] = M
+        filled.append(every[:N])
+    return np.concatenate(filled, axis=1)
+
+
+def at_last(M: np.ndarray, steps: tuple[int, ...], N: int) -> np.ndarray:
+    """Return a matrix at step N, which is one of the steps."""
+    return M[steps.index(N)] if M.ndim == 3 else M
 
 
 def terminal_ball(mpc: MPC) -> tuple[np.ndarray | None, np.ndarray | None, np.ndarray | None]:
@@ -416,12 +458,24 @@ def limits_of_states(mpc: MPC) -> list[np.ndarray]:
             bound[:, :n] = np.maximum(bound[0, :n], lower), np.minimum(bound[1, :n], upper)
         found.append(bound)
     if mpc.dimension > n:
-        found[0][:, n:] = set_bounds(mpc.inputs, mpc.system.m)
+        found[0][:, n:] = set_bounds(at_stage(mpc.inputs, 0), mpc.system.m)
     return found
 
 
-def input_size(A: np.ndarray, B: np.ndarray, c: np.ndarray, size: list[np.ndarray]) -> np.ndarray:
-    """Return bounds (N, m) of |u_k| from those of |x_k|, k = 0..N, by u_k = B⁺(x_{k+1} − A x_k −
+def around(limits: Any) -> Any:
+    """Return a box around limits at all of their stages; the same where they are those of all."""
+    if not differing(limits):
+        return limits
+    stages = max(len(np.asarray(getattr(limits, name))) for name in differing(limits))
+    n = limits.dimension
+    ends = np.array([set_bounds(at_stage(limits, j), n) for j in range(stages)])
+    return Box(ends[:, 0].min(axis=0), ends[:, 1].max(axis=0))
+
+
+def input_size(
+    A: np.ndarray, B: np.ndarray, c: np.ndarray, before: np.ndarray, after: np.ndarray
+) -> np.ndarray:
+    """Return bounds (m,) of |u_k| from those of |x_k| and |x_{k+1}|, by u_k = B⁺(x_{k+1} − A x_k −
     c).
 
     ∞ where there is none, and where B has dependent columns.
@@ -429,15 +483,12 @@ def input_size(A: np.ndarray, B: np.ndarray, c: np.ndarray, size: list[np.ndarra
     M, (n, m) = np.linalg.pinv(B), B.shape
     off = np.abs(M @ B - np.eye(m)) + n * 1e-15 * np.abs(M) @ np.abs(B)
     if off.max() > 1e-8:
-        return np.full((len(size) - 1, m), np.inf)
+        return np.full(m, np.inf)
     with np.errstate(invalid="ignore"):  # 0·inf below counts as 0
-        terms = [
-            after + np.nansum(np.abs(A) * before, axis=1) + np.abs(c)
-            for before, after in itertools.pairwise(size)
-        ]
-        bound = np.nansum(np.abs(M) * np.array(terms)[:, None, :], axis=2)
+        terms = after + np.nansum(np.abs(A) * before, axis=1) + np.abs(c)
+        bound = np.nansum(np.abs(M) * terms, axis=1)
     # B⁺B is the unit matrix to 1e-8, and sums are rounded.
-    return bound + 1e-6 * bound.max(axis=1, keepdims=True)
+    return bound + 1e-6 * bound.max()
 
 
 def one_sided(lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

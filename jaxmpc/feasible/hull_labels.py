@@ -123,7 +123,7 @@ def label_limits(
     `proofs.gamma`, λ is off by no more than ‖I − M E‖ + O(γ) ‖|M||E|‖ in the hull, four times which
     is allowed for; and inputs by d max|u_i − u_c| times that, in `roll_out` as `moved`.
     """
-    d, N, (_, m) = points.shape[1], p.horizon, p.B.shape
+    d, N, (_, m) = points.shape[1], p.horizon, p.sizes
     edges = edges_of(points, facets)
     size = largest_row_sum(np.abs(M) @ np.abs(edges))
     off = 4 * (largest_row_sum(np.eye(d) - M @ edges) + 4 * proofs.gamma(d + 3) * size)
@@ -152,7 +152,7 @@ def label_limits(
 def _slack(p: ExactData, points: Array, values: Array, moved: Array) -> Array:
     """Return the slack of `roll_out` (2, K) from the points with these inputs: as they are, and
     where each may be off by `moved`."""
-    N, (_, m) = p.horizon, p.B.shape
+    N, (_, m) = p.horizon, p.sizes
     none = jnp.zeros(0)
 
     def one(theta: Array, inputs: Array, moved: Any) -> Array:
@@ -221,7 +221,7 @@ def label(hull: Hull, theta: Array) -> Array:
 
 def verdict(p: ExactData, hull: Hull, theta: Array) -> proofs.Verdict:
     """Return the verdict on θ (d,), with its proof."""
-    N, (_, m) = p.horizon, p.B.shape
+    N, (_, m) = p.horizon, p.sizes
     cone, facet = nearest_cone(hull, theta)
     value = hull.value + jnp.sum(hull.slope[cone] * (theta - hull.center), axis=1)
     inputs, free = value[: N * m].reshape(N, m), value[N * m :]

@@ -15,7 +15,7 @@ from jaxmpc.feasible.hard_constraints import Axes, ExactData, View, make_view
 from jaxmpc.feasible.plan_polytope import PlanPolytope
 from jaxmpc.files import as_json
 from jaxmpc.mpc.condense import Condensed, condensed_in_float64
-from jaxmpc.mpc.problem import HARD, MPC, Outputs, as_tuple
+from jaxmpc.mpc.problem import MPC, Outputs, as_tuple, differing
 from jaxmpc.mpc.rows import Block
 from jaxmpc.mpc.tightening import feedback_gain, require_tightened, without_disturbance
 from jaxmpc.pytrees import record
@@ -49,7 +49,7 @@ class FeasibilityProblem:
         require_kind("mpc", mpc, MPC)
         mpc.validate()
         require_tightened(mpc, "what labels by one sequence of inputs")
-        mpc.require_constant("the feasible set is that of one problem", *HARD)
+        mpc = with_constant_sets(mpc)
         boxes = {name: as_box(getattr(mpc, name)) for name in ("states", "inputs", "terminal_set")}
         hard = with_equalities(replace(mpc, soft=(), input_rate_weight=None, **boxes))
         return cls(hard, make_view(hard, axes, fixed))
@@ -101,7 +101,7 @@ class FeasibilityProblem:
         """Return the rows without prestabilisation, in units that grow as the slowest and as the
         fastest unstable mode do; none where no mode is unstable. Multipliers of late rows are tiny
         beside those of early ones, and precise in such units alone."""
-        moduli = np.abs(np.linalg.eigvals(np.asarray(self.mpc.system.A, float)))
+        moduli = np.abs(np.linalg.eigvals(np.asarray(self.mpc.system.A, float))).ravel()
         moduli = moduli[moduli > 1 + 1e-9]
         if not len(moduli):
             return ()
@@ -135,11 +135,12 @@ class FeasibilityProblem:
     def plain(self) -> dict[str, Any]:
         """Return the hard constraints as JSON data, from which stored labels can be verified.
 
-        A, B, c of x⁺ = Ax + Bu + c over `horizon` steps; moves: index of the free move that each
-        input equals. rows: lower ≤ Hx + Du ≤ upper at steps (None: no bound). ellipsoid: P and
-        level of x_N'Px_N ≤ level, or None. disturbance: of a robust problem, whose rows are those
-        before they are tightened, the matrix E, the gain K and the set W. axes: the mapped states;
-        others: the index of those that are not, and their value or bounds.
+        A, B, c of x⁺ = Ax + Bu + c over `horizon` steps, each with a leading axis where it differs
+        from step to step, as H, D, lower and upper may for their steps; moves: index of the free
+        move that each input equals. rows: lower ≤ Hx + Du ≤ upper at steps (None: no bound).
+        ellipsoid: P and level of x_N'Px_N ≤ level, or None. disturbance: of a robust problem, whose
+        rows are those before they are tightened, the matrix E, the gain K and the set W. axes: the
+        mapped states; others: the index of those that are not, and their value or bounds.
         """
         mpc, view, set_ = self.mpc, self.view, self.mpc.terminal_set
         A, B, c = hard_constraints.augmented_dynamics(mpc)
@@ -200,6 +201,24 @@ def with_previous_inputs(mpc: MPC, c: Condensed) -> Condensed:
         }
         c = replace(c, layout=((b.kind, b.steps, b.size), *c.layout), **more)
     return c
+
+
+def with_constant_sets(mpc: MPC) -> MPC:
+    """Return the problem with limits that differ from stage to stage as outputs, and a box around
+    them in their place; a box of inputs as it is."""
+    n, N = mpc.system.n, mpc.horizon
+    outputs = list(as_tuple("outputs", mpc.outputs, Outputs))
+    changes: dict[str, Any] = {}
+    for name, stages in (("states", mpc.state_stages), ("inputs", tuple(range(N)))):
+        set_ = getattr(mpc, name)
+        if not differing(set_) or (name == "inputs" and isinstance(set_, Box)):
+            continue
+        H, lower, upper = set_.rows()
+        labels = set_.labels if isinstance(set_, Polytope) else mpc.system.state_names
+        C, D = (H, None) if name == "states" else (np.zeros((np.shape(H)[-2], n)), H)
+        outputs.append(Outputs(C, lower, upper, D, stages, labels))
+        changes[name] = hard_constraints.around(set_)
+    return replace(mpc, outputs=tuple(outputs), **changes) if changes else mpc
 
 
 def with_equalities(mpc: MPC) -> MPC:

@@ -51,6 +51,7 @@ from jax import Array
 
 from jaxmpc.feasible.hard_constraints import ExactData
 from jaxmpc.pytrees import pytree
+from jaxmpc.qp.linalg import by_step
 
 UNIT_ROUNDOFF = 2.0**-53
 # Covers products that underflow; data smaller than this count as zero.
@@ -131,14 +132,9 @@ def roll_out(p: ExactData, x: Array, inputs: Array, moved: Array) -> tuple[Array
     may do to it: all hold where it is ≥ 0, and it is −∞ or NaN where the numbers overflow. Then how
     far the q are off, and a bound of that.
     """
-    n, m = p.B.shape
-    A, B, c = jnp.asarray(p.A), jnp.asarray(p.B), jnp.asarray(p.c)
-    rows, rows_N = jnp.concatenate([p.H, p.D], axis=1), jnp.asarray(p.H_N)
-    # Twice the first-order bound covers the rounding of the bound itself. A state that stays as it
-    # is, or takes the value of another one or of an input, is not rounded.
-    copied = row_gamma(jnp.concatenate([A, B, c[:, None]], axis=1)) == 0
-    copied = copied & (c == 0)
-    growth, tiny = jnp.where(copied, 0.0, 2 * gamma(n + m + 2)), jnp.where(copied, 0.0, TINY)
+    n, m = p.sizes
+    each, at = by_step(*((jnp.asarray(v), axes) for v, axes in p.stepwise))
+    rows_N = jnp.asarray(p.H_N)
     e = p.equalities
     solved = np.zeros(np.shape(p.lower), bool) if e is None else e.at
     solved_N = np.zeros(np.shape(p.lower_N), bool) if e is None else e.at_N
@@ -150,15 +146,21 @@ def roll_out(p: ExactData, x: Array, inputs: Array, moved: Array) -> tuple[Array
         return jnp.min(jnp.where(solved, jnp.inf, slack), initial=jnp.inf), value - upper, size
 
     def advance(carry, step):
-        (x, error), (u, u_error, lower, upper, solved) = carry, step
+        (x, error), (own, u, u_error, lower, upper, solved) = carry, step
+        A, B, c, H, D = at(own)
         here = jnp.concatenate([x, u]), jnp.concatenate([error, u_error])
-        found = holds(rows, lower, upper, solved, *here)
+        found = holds(jnp.concatenate([H, D], axis=1), lower, upper, solved, *here)
+        # Twice the first-order bound covers the rounding of the bound itself. A state that stays as
+        # it is, or takes the value of another one or of an input, is not rounded.
+        copied = row_gamma(jnp.concatenate([A, B, c[:, None]], axis=1)) == 0
+        copied = copied & (c == 0)
+        growth, tiny = jnp.where(copied, 0.0, 2 * gamma(n + m + 2)), jnp.where(copied, 0.0, TINY)
         bound = jnp.abs(A) @ jnp.abs(x) + jnp.abs(B) @ jnp.abs(u) + jnp.abs(c)
         error = jnp.abs(A) @ error + jnp.abs(B) @ u_error
         error = error * (1 + 1e-9) + growth * bound + tiny
         return (A @ x + B @ u + c, error), found[0] if e is None else found
 
-    steps = (inputs, moved, *map(jnp.asarray, (p.lower, p.upper, solved)))
+    steps = (each, inputs, moved, *map(jnp.asarray, (p.lower, p.upper, solved)))
     (x, error), found = jax.lax.scan(advance, (x, jnp.zeros_like(x)), steps)
     last, off_N, size_N = holds(rows_N, p.lower_N, p.upper_N, solved_N, x, error)
     slack = jnp.minimum(jnp.min(found if e is None else found[0]), last)
@@ -186,9 +188,8 @@ def cut(p: ExactData, y_states: Array, y_N: Array, y_ball: Array) -> Cut:
     rows L'x of the terminal ellipsoid P = LL', any length without one. b = inf where nothing can
     be said. The multipliers are scaled to about one first.
     """
-    n, m = p.B.shape
-    N, r = p.horizon, p.H.shape[0]
-    A, B, c, H, D = (jnp.asarray(v) for v in (p.A, p.B, p.c, p.H, p.D))
+    (n, m), (N, r) = p.sizes, p.lower.shape
+    each, at = by_step(*((jnp.asarray(v), axes) for v, axes in p.stepwise))
     parts = (y_states, y_N, y_ball) if p.P is not None else (y_states, y_N)
     top = sum(jnp.max(jnp.abs(y), initial=0.0) for y in parts)
     scale = jnp.exp2(-jnp.floor(jnp.log2(jnp.where(top > 0, top, 1.0))))
@@ -220,7 +221,8 @@ def cut(p: ExactData, y_states: Array, y_N: Array, y_ball: Array) -> Cut:
 
     def back(carry, step):
         p_next, moved, total, size = carry
-        y, lower, upper, left, side, reach = step
+        own, y, lower, upper, left, side, reach = step
+        A, B, c, H, D = at(own)
         y, row_total, row_size = support(y, lower, upper)
         p_next, size = p_next + unit * side * moved, size + reach @ moved
         moved = left * moved + jnp.abs(p_next)
@@ -233,7 +235,7 @@ def cut(p: ExactData, y_states: Array, y_N: Array, y_ball: Array) -> Cut:
 
     errors = map(jnp.asarray, (p.left, p.side, p.reach))
     sides = jnp.asarray(p.widest.lower), jnp.asarray(p.widest.upper)
-    steps = (y_states * scale, *sides, *errors)
+    steps = (each, y_states * scale, *sides, *errors)
     start = (p_N, moved, total, size)
     (p_0, moved, total, size), inputs = jax.lax.scan(back, start, steps, reverse=True)
     same = np.equal.outer(np.arange(max(p.moves) + 1), np.array(p.moves)).astype(float)

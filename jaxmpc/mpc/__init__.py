@@ -12,10 +12,13 @@ active_constraints    which rows of a plan are active -> ActiveConstraint
 row_table             each row of the problem: kind, name, unit, step -> Row
 soften, harden        make rows soft or hard
 first_step_in         keep a robust control invariant set by its first step -> MPC
+pad_horizon           a longer horizon with the same plans -> MPC
+stack_horizons        problems of different horizons as one batch for jax.vmap -> MPC
 """
 
 from jaxmpc.mpc.controller import Controller, solve
 from jaxmpc.mpc.first_step import first_step_in
+from jaxmpc.mpc.horizons import pad_horizon, stack_horizons
 from jaxmpc.mpc.many import solve_many
 from jaxmpc.mpc.plan import Control, Plan, WarmStart, active_constraints
 from jaxmpc.mpc.problem import MPC, Outputs, Soft, harden, soften
@@ -39,10 +42,12 @@ __all__ = [
     "equilibrium",
     "first_step_in",
     "harden",
+    "pad_horizon",
     "row_table",
     "soften",
     "solve",
     "solve_many",
     "solve_nonlinear",
     "solve_stagewise",
+    "stack_horizons",
 ]

@@ -62,7 +62,7 @@ def roll_out_exactly(p: Constraints, starts: np.ndarray, plans: np.ndarray) -> n
     if rows:
         change = integers(X, e)
         missed = _at(p, e, rows, x, u, one, p.upper)
-        G = -_at(p, e, rows, np.zeros((len(X), len(p.A)), object), change, 0, None).T
+        G = -_at(p, e, rows, np.zeros((len(X), p.sizes[0]), object), change, 0, None).T
         inverse = _inverse(G)
         if inverse is not None:
             K, one = inverse  # the inverse of G is K / one
@@ -92,7 +92,7 @@ def _values(
 ) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
     """Yield k, the values (b, rows) of its rows, over 2^((k+2)e), and x_k, over 2^((k+1)e), along
     inputs u (b, N, m) over 2ᵉ from x (b, n). All are multiplied by the integer `one`."""
-    A, B, c = (integers(v, e) for v in (p.A, p.B, p.c))
+    motion = _motion(p, e)
     for k in range(p.N + 1):
         later = 1 << k * e
         value = x @ integers(p.H[k], e).T
@@ -100,7 +100,18 @@ def _values(
             value = value + (u[:, k] @ integers(p.D[k], e).T) * later
         yield k, value, x
         if k < p.N:
+            A, B, c = motion[k]
             x = x @ A.T + (u[:, k] @ B.T) * later + c * (one * (later << e))
+
+
+def _motion(p: Constraints, e: int) -> list[tuple[np.ndarray, ...]]:
+    """Return A, B and c of each step as integers over 2ᵉ."""
+    found: list[tuple[np.ndarray, ...]] = []
+    for k, here in enumerate(zip(p.A, p.B, p.c, strict=True)):
+        before = found[-1] if k else ()
+        same = k and here[0] is p.A[k - 1] and here[1] is p.B[k - 1] and here[2] is p.c[k - 1]
+        found.append(before if same else tuple(integers(v, e) for v in here))
+    return found
 
 
 def _at(
@@ -144,7 +155,7 @@ def _inverse(G: np.ndarray) -> tuple[np.ndarray, int] | None:
 
 def roll_out_in_floats(p: Constraints, starts: np.ndarray, plans: np.ndarray) -> np.ndarray:
     """Return the same in float64, less a bound on its rounding: at least so much room is left."""
-    n, m = p.B.shape
+    n, m = p.sizes
     gamma = 4 * (n + m + 2) * UNIT_ROUNDOFF
     x, error, least = starts, np.zeros_like(starts), np.full(len(starts), np.inf)
     for k in range(p.N + 1):
@@ -155,9 +166,10 @@ def roll_out_in_floats(p: Constraints, starts: np.ndarray, plans: np.ndarray) ->
         room = np.minimum(p.upper[k] - value, value - p.lower[k]) - off
         least = np.minimum(least, room.min(axis=1, initial=np.inf))
         if k < p.N:
-            size = np.abs(x) @ np.abs(p.A).T + np.abs(u) @ np.abs(p.B).T + np.abs(p.c)
-            error = 1.01 * error @ np.abs(p.A).T + gamma * size
-            x = x @ p.A.T + u @ p.B.T + p.c
+            A, B, c = p.A[k], p.B[k], p.c[k]
+            size = np.abs(x) @ np.abs(A).T + np.abs(u) @ np.abs(B).T + np.abs(c)
+            error = 1.01 * error @ np.abs(A).T + gamma * size
+            x = x @ A.T + u @ B.T + c
     if p.P is not None:
         whole = np.abs(x) + error
         square = np.einsum("bi,ij,bj->b", x, p.P, x)
@@ -176,9 +188,9 @@ def beyond(
     terminal ellipsoid, the vector v of v'Px ≤ √(level·v'Pv). box: lower and upper bounds (moves, m)
     of the inputs and of the states that are not mapped, ±∞ where there are none.
     """
-    n, (low, high, others_low, others_high) = len(p.A), box
+    n, (low, high, others_low, others_high) = p.sizes[0], box
     e = p.exponent(points, *box, *y)
-    A, B, c = (integers(v, e) for v in (p.A, p.B, p.c))
+    motion = _motion(p, e)
     # Sums are over 2^top. The costate p_k is over 2^((N−k+2)e): each step multiplies by A.
     top, total = (p.N + 4) * e, 0
     lowers, uppers = p.widest
@@ -190,6 +202,7 @@ def beyond(
         bound = np.where(weight > 0, uppers[k], np.where(weight < 0, lowers[k], 0.0))
         total += int(w @ integers(bound, e)) << top - 2 * e
         if k < p.N:
+            A, B, c = motion[k]
             total -= int(costate @ c) << top - (p.N - k + 2) * e
             slopes[p.moves[k]] -= (costate @ B) * (1 << top - e - (p.N - k + 2) * e)
             slopes[p.moves[k]] -= (w @ integers(p.D[k], e)) * (1 << top - 3 * e)

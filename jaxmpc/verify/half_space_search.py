@@ -50,7 +50,7 @@ class Programs:
 
     def __init__(self, p: Constraints) -> None:
         """Assemble the equations of motion and the rows."""
-        self.p, (n, m) = p, p.B.shape
+        self.p, (n, m) = p, p.sizes
         self.states, self.count = n * (p.N + 1), n * (p.N + 1) + m * (int(p.moves.max()) + 1)
         motion = sp.lil_matrix((n * p.N, self.count))
         parts, bounds, self.place = [], [], []
@@ -61,15 +61,15 @@ class Programs:
             if k < p.N:
                 u = slice(self.states + p.moves[k] * m, self.states + (p.moves[k] + 1) * m)
                 block[:, u] = p.D[k]
-                motion[k * n : (k + 1) * n, x] = -p.A
+                motion[k * n : (k + 1) * n, x] = -p.A[k]
                 motion[k * n : (k + 1) * n, (k + 1) * n : (k + 2) * n] = np.eye(n)
-                motion[k * n : (k + 1) * n, u] = -p.B
+                motion[k * n : (k + 1) * n, u] = -p.B[k]
             for bound, sign in ((p.widest[1][k], 1.0), (p.widest[0][k], -1.0)):
                 there = np.flatnonzero(np.isfinite(bound))
                 parts.append(sign * block.tocsr()[there])
                 bounds.append(sign * bound[there])
                 self.place += [(k, int(i), sign) for i in there]
-        self.motion, self.drift = motion.tocsr(), np.tile(p.c, p.N)
+        self.motion, self.drift = motion.tocsr(), np.concatenate(p.c)
         self.rows, self.bounds = sp.vstack(parts).tocsr(), np.concatenate(bounds)
         self.tangents: list[np.ndarray] = []
         if p.P is not None:  # its box
@@ -82,7 +82,7 @@ class Programs:
     def solve(self, cost: np.ndarray, theta: np.ndarray | None = None) -> Any:
         """Return the least cost'v over all trajectories; with theta (d,) the least violation t of
         the rows over those from there instead."""
-        p, n = self.p, len(self.p.A)
+        p, n = self.p, self.p.sizes[0]
         elastic = theta is not None
         variables = [(None, None)] * self.count
         for i, lower, upper in zip(p.others, p.low, p.high, strict=True):
@@ -141,7 +141,7 @@ class Programs:
         mapped: the limits on each alone, and where there are none those of linear programs over all
         trajectories, enlarged by a part in 10⁶ of their size; ±∞ where there are none."""
         p = self.p
-        size = int(p.moves.max()) + 1, p.B.shape[1]
+        size = int(p.moves.max()) + 1, p.sizes[1]
         low, high = np.full(size, -np.inf), np.full(size, np.inf)
         for move, i, least, most in p.input_rows():
             low[move, i], high[move, i] = max(low[move, i], least), min(high[move, i], most)

@@ -408,14 +408,15 @@ def wrong_next_states(p: Constraints, found: Stored) -> list[str]:
         after = np.concatenate([after, at["next_state"][None]])
         lost = np.append(lost, True)
     where = np.flatnonzero(lost)
-    expected = states[where] @ p.A.T + inputs[where] @ p.B.T + p.c
-    size = np.abs(states[where]) @ np.abs(p.A).T + np.abs(inputs[where]) @ np.abs(p.B).T
-    wrong = np.any(np.abs(after[where] - expected) > 1e-12 * (size + np.abs(p.c)), axis=1)
-    normals = arrays.get("facet_normals", np.zeros((0, len(p.A))))
+    A, B, c = p.A[0], p.B[0], p.c[0]
+    expected = states[where] @ A.T + inputs[where] @ B.T + c
+    size = np.abs(states[where]) @ np.abs(A).T + np.abs(inputs[where]) @ np.abs(B).T
+    wrong = np.any(np.abs(after[where] - expected) > 1e-12 * (size + np.abs(c)), axis=1)
+    normals = arrays.get("facet_normals", np.zeros((0, len(A))))
     if len(normals):
         normals = normals[np.argmax(after[where] @ normals.T - arrays["facet_offsets"], axis=1)]
     else:
-        normals = np.full((len(where), len(p.A)), np.nan)
+        normals = np.full((len(where), len(A)), np.nan)
     excess = exclude(p, after[where], normals)
     for i, follows, beyond_by in zip(where, ~wrong, excess, strict=True):
         name = f"next state of state {i}" if i < len(arrays["state"]) else "counterexample"

@@ -17,19 +17,20 @@ def label_shapes(attributes: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
     if not isinstance(problem, dict):
         return {}
     try:
-        (n, m), N, d = np.shape(problem["B"]), problem["horizon"], len(problem["axes"])
+        (n, m), N, d = np.shape(problem["B"])[-2:], problem["horizon"], len(problem["axes"])
         moves, others, ball = problem["moves"], problem["others"]["index"], problem["ellipsoid"]
         fine = (
-            np.shape(problem["A"]) == (n, n)
-            and np.shape(problem["c"]) == (n,)
-            and type(N) is int
+            type(N) is int
+            and np.shape(problem["A"]) in ((n, n), (N, n, n))
+            and np.shape(problem["B"]) in ((n, m), (N, n, m))
+            and np.shape(problem["c"]) in ((n,), (N, n))
             and len(moves) == N > 0
             and all(type(move) is int and 0 <= move < N for move in moves)
             and sorted([*problem["axes"], *others]) == list(range(n))
             and all(
-                np.shape(b["H"]) in ((len(b["lower"]), n), (0,))
-                and np.shape(b["D"]) in ((len(b["lower"]), m), (0,))
-                and len(b["lower"]) == len(b["upper"])
+                _fits(b["H"], b, n)
+                and _fits(b["D"], b, m)
+                and np.shape(b["lower"]) == np.shape(b["upper"])
                 and all(type(k) is int and 0 <= k <= N for k in b["steps"])
                 and len(set(b["steps"])) == len(b["steps"])
                 for b in problem["rows"]
@@ -46,31 +47,53 @@ def label_shapes(attributes: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
     return {**shapes, "plan": (N, m), "start": (n,), "cut_normal": (d,)}
 
 
+def _fits(M: Any, rows: Mapping[str, Any], size: int) -> bool:
+    """Return whether a matrix of stored rows has one for each of their bounds, and this many
+    columns; it may differ from step to step."""
+    count, steps = np.shape(rows["lower"])[-1], len(rows["steps"])
+    return np.shape(M) in ((count, size), (0,), (steps, count, size))
+
+
 class Constraints:
     """The hard constraints as float64 arrays: of each step k = 0..N the rows H[k], D[k], lower[k],
-    upper[k], D[N] being zero. widest: lower and upper of a robust problem rounded outwards, where
-    lower and upper are rounded inwards; else the same. plain: the attribute `problem` of the
-    store, JSON data that `FeasibilityProblem.plain` describes."""
+    upper[k], D[N] being zero, and of each step k < N the motion A[k], B[k], c[k]. widest: lower and
+    upper of a robust problem rounded outwards, where lower and upper are rounded inwards; else the
+    same. plain: the attribute `problem` of the store, JSON data that `FeasibilityProblem.plain`
+    describes."""
 
     def __init__(self, plain: Mapping[str, Any]) -> None:
         """Stack the rows of each step."""
-        self.A, self.B, self.c = (np.array(plain[k], float) for k in ("A", "B", "c"))
         self.N, self.moves = plain["horizon"], np.array(plain["moves"])
-        n, m = self.B.shape
-        bound = lambda values, none: np.array([none if v is None else v for v in values], float)
+        self.A, self.B, self.c = (
+            _by_step(np.array(plain[name], float), axes, self.N)
+            for name, axes in (("A", 2), ("B", 2), ("c", 1))
+        )
+        self.sizes = n, m = self.B[0].shape
+        number = lambda v, none: none if v is None else v
+        bound = lambda values, none: np.array(
+            [
+                [number(w, none) for w in v] if isinstance(v, list) else number(v, none)
+                for v in values
+            ],
+            float,
+        )
         rows: list[list[tuple[Any, ...]]] = [[] for _ in range(self.N + 1)]
         for b in plain["rows"]:
-            H = np.array(b["H"], float).reshape(-1, n)
-            D = np.array(b["D"], float).reshape(-1, m)
-            lower, upper = bound(b["lower"], -np.inf), bound(b["upper"], np.inf)
-            for k in b["steps"]:
-                rows[k].append((H, D if k < self.N else 0 * D, lower, upper))
+            count = len(b["steps"])
+            H, D = (
+                _by_step(M if M.ndim == 3 else M.reshape(-1, size), 2, count)
+                for M, size in ((np.array(b["H"], float), n), (np.array(b["D"], float), m))
+            )
+            sides = bound(b["lower"], -np.inf), bound(b["upper"], np.inf)
+            lower, upper = (_by_step(side, 1, count) for side in sides)
+            for k, H_k, D_k, *ends in zip(b["steps"], H, D, lower, upper, strict=True):
+                rows[k].append((H_k, D_k if k < self.N else 0 * D_k, *ends))
         none = np.zeros((0, n)), np.zeros((0, m)), np.zeros(0), np.zeros(0)
         stacked = [[np.concatenate(v) for v in zip(none, *at, strict=True)] for at in rows]
         self.H, self.D, self.lower, self.upper = (list(v) for v in zip(*stacked, strict=True))
         self.widest = self.lower, self.upper
         if "disturbance" in plain:
-            arrays = self.A, self.B, self.H, self.D, self.lower, self.upper
+            arrays = self.A[0], self.B[0], self.H, self.D, self.lower, self.upper
             (self.lower, self.upper), self.widest = tightened(plain["disturbance"], *arrays)
         ball = plain["ellipsoid"]
         self.P = None if ball is None else np.zeros((n, n))
@@ -91,7 +114,7 @@ class Constraints:
         """The rows (k, i) with lower = upper that inputs move, and changes (q, N, m) of the inputs
         that change the values of one of these q rows each by about one: the pseudoinverse of the
         matrix by which the moves act on them."""
-        n, m = self.B.shape
+        n, m = self.sizes
         moves = int(self.moves.max()) + 1
         states, rows, where = np.zeros((moves * m, n)), [], []
         for k in range(self.N + 1):
@@ -103,7 +126,8 @@ class Constraints:
             for i in np.flatnonzero((self.lower[k] == self.upper[k]) & np.any(values, axis=0)):
                 where.append((k, int(i)))
                 rows.append(values[:, i])
-            states = states @ self.A.T + u @ self.B.T
+            if k < self.N:
+                states = states @ self.A[k].T + u @ self.B[k].T
         X = np.linalg.pinv(np.reshape(rows, (-1, moves * m)))
         return where, X.T.reshape(-1, moves, m)[:, self.moves]
 
@@ -120,12 +144,18 @@ class Constraints:
 
     def exponent(self, *more: np.ndarray) -> int:
         """Return e such that all data, and these arrays, are integers over 2ᵉ."""
-        parts = [self.A, self.B, self.c, self.low, self.high]
+        parts = [*self.A, *self.B, *self.c, self.low, self.high]
         parts += [*self.H, *self.D, *self.lower, *self.upper, *more]
         parts += [*self.widest[0], *self.widest[1]]
         if self.P is not None:
             parts += [self.P, np.array(self.level)]
         return max(0, *(_bits(v) for v in parts))
+
+
+def _by_step(values: np.ndarray, axes: int, steps: int) -> list[np.ndarray]:
+    """Return the value at each step of an array that has so many axes at one step, the same array
+    where it does not differ."""
+    return list(values) if values.ndim > axes else [values] * steps
 
 
 def _bits(values: Any) -> int:

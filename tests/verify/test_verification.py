@@ -37,6 +37,18 @@ def chain():
     return jm.LinearSystem(A, np.array([[0.0, 0.1], [0.4, 0.0], [0.0, 0.5]]))
 
 
+def differing(**fields):
+    """Everything is another one at each step."""
+    random = np.random.default_rng(2)
+    moved = lambda M: np.asarray(M, float) + 0.05 * random.normal(size=(5, *np.shape(M)))
+    rows = jm.Outputs(random.normal(size=(5, 1, 2)), upper=np.linspace(0.9, 1.2, 5)[:, None])
+    return mpc(
+        jm.LinearSystem(moved(SYSTEM.A), moved(SYSTEM.B), moved(np.zeros(2))),
+        states=jm.Polytope(moved(np.vstack([np.eye(2), -np.eye(2)])), moved([1.2, 1.0, 1, 1.5])),
+        inputs=jm.Box(moved([-1.0]), [0.8]), outputs=rows, **fields,
+    )  # fmt: skip
+
+
 def diamond(size):
     H = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
     return jm.Polytope(H, np.full(4, size))
@@ -61,6 +73,11 @@ PROBLEMS = {
     "inputs without limits": (mpc(inputs=None), None, None),
     "input rates": (
         mpc(input_rate_limit=np.array([0.3]), terminal_set=diamond(0.4)), (0, 1),
+        np.array([0.0, 0.0, 0.1]),
+    ),
+    "steps that differ": (differing(), None, None),
+    "steps that differ, input rates": (
+        differing(input_rate_limit=np.linspace(0.2, 0.4, 5)[:, None]), (0, 1),
         np.array([0.0, 0.0, 0.1]),
     ),
 }  # fmt: skip

@@ -1,0 +1,80 @@
+"""Problems of different horizons in one batch: plans beside those of each problem alone."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+import jaxmpc as jm
+from jaxmpc.mpc import pad_horizon, solve_stagewise, stack_horizons
+from jaxmpc.mpc.condense import condense
+
+SYSTEM = jm.LinearSystem([[1.1, 0.2], [0.0, 1.05]], [[0.02], [0.2]], [0.0, 0.01])
+HORIZONS = (3, 5, 8)
+X0 = np.array([[0.5, -0.2], [0.6, 0.1], [-0.7, 0.2]])
+
+
+@pytest.fixture(autouse=True, scope="module")
+def double_precision():
+    with jax.enable_x64(True):
+        yield
+
+
+def problem(horizon, **fields):
+    given = {
+        "states": jm.Box([-1.0, -0.5], [0.8, 0.6]), "inputs": jm.Box(-1.0, 1.0),
+        "terminal_cost": 3 * np.eye(2), "terminal_set": jm.Box(-0.9, 0.9),
+        "input_rate_weight": 0.1, "input_rate_limit": 0.8,
+        "soft": jm.Soft([[1.0, 1.0]], upper=[0.3], rho=2.0, quadratic=1.0),
+        "outputs": jm.Outputs([[0.0, 1.0]], upper=[0.5], stages=(1, horizon)),
+    }  # fmt: skip
+    return jm.MPC(SYSTEM, np.diag([1.0, 0.2]), 0.1, horizon, **{**given, **fields})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("solve", [jm.solve, solve_stagewise])
+def test_a_batch_of_horizons_has_the_plans_of_each_alone(solve):
+    problems = [problem(N) for N in HORIZONS]
+    plans = jax.vmap(lambda p, x: solve(p, x, previous_input=[0.2]))(stack_horizons(problems), X0)
+    assert np.all(plans.solved)
+    for i, mpc in enumerate(problems):
+        alone = solve(mpc, X0[i], previous_input=[0.2])
+        N = mpc.horizon
+        np.testing.assert_allclose(plans.inputs[i, :N], alone.inputs, atol=1e-12)
+        np.testing.assert_allclose(plans.states[i, : N + 1], alone.states, atol=1e-12)
+        np.testing.assert_allclose(plans.inputs[i, N:], 0, atol=1e-12)
+        np.testing.assert_allclose(plans.cost[i], alone.cost, rtol=1e-12)
+
+
+@pytest.mark.parametrize("blocks", [None, 2, (1, 2)])
+def test_the_padded_program_is_the_same_in_the_moves_of_the_problem(blocks):
+    """Hessian, linear terms and rows with a limit, without any solver."""
+    mpc = problem(3, control_horizon=blocks)
+    a, b = condense(mpc), condense(pad_horizon(mpc, 6))
+    nz = a.P.shape[0]
+    np.testing.assert_allclose(b.P[:nz, :nz], a.P, atol=1e-13)
+    np.testing.assert_array_equal(b.P[:nz, nz:], 0)
+    assert np.all(np.linalg.eigvalsh(b.P) > 0)
+    np.testing.assert_allclose(b.F[:nz], a.F, atol=1e-13)
+    np.testing.assert_array_equal(b.F[nz:], 0)
+    np.testing.assert_allclose(b.f[:nz], a.f, atol=1e-13)
+    limits = lambda c: np.isfinite(c.lower) | np.isfinite(c.upper)
+    rows = lambda c: np.column_stack(
+        [c.C[:, :nz], c.D, c.d, np.nan_to_num(c.lower, neginf=-9), np.nan_to_num(c.upper, posinf=9)]
+    )[limits(c)]
+    np.testing.assert_allclose(rows(b), rows(a), atol=1e-13)
+    assert not np.any(b.C[limits(b), nz:])
+
+
+def test_wrong_problems_are_named():
+    with pytest.raises(ValueError, match="horizon: 2. Give a whole number of at least 3"):
+        pad_horizon(problem(3), 2)
+    other = replace(problem(4), outputs=(), input_rate_weight=None)
+    with pytest.raises(ValueError, match=r"problems\[1\]: has other sizes, limits or settings"):
+        stack_horizons([problem(3), other])
+    with pytest.raises(ValueError, match="problems: is a list without problems"):
+        stack_horizons([])
+    robust = jm.MPC(SYSTEM, np.eye(2), 1.0, 3, jm.Box(-1, 1), disturbance=jm.Box(-0.1, 0.1))
+    with pytest.raises(ValueError, match="mpc.disturbance: given"):
+        pad_horizon(robust, 5)
