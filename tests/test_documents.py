@@ -86,6 +86,8 @@ def holds_learning(after, said):
     assert all(np.abs(v).max() > 0 for v in (*theta.values(), network.layers[0].weight))
     assert np.abs(after[3]["gradient"]["theta"].get_value()["Q"]).max() > 0
     assert after[4]["states"].shape == (64, 20, 2)
+    assert "'inputs.upper': (5,)" in said and after[6]["plans"].inputs.shape == (3, 5, 1)
+    assert after[6]["plans"].solved.all()
 
 
 def holds_theory(after, said):

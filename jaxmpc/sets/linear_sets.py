@@ -596,7 +596,8 @@ class Box(LinearSet):
     Arguments:
         lower, upper: (n,) arrays, in the units of x; -inf and inf for no bound. A number beside an
             array stands for all its coordinates; two numbers are an interval, n = 1, and in an
-            `MPC` the bounds of every coordinate.
+            `MPC` the bounds of every coordinate. There, and there alone, (N, n) are the bounds of
+            each of N stages.
 
     lower > upper in a coordinate makes it the empty set. All methods but `contains`, `support`,
     `tightened` and `rows` run in NumPy, not traceable.
@@ -608,9 +609,9 @@ class Box(LinearSet):
     def __post_init__(self) -> None:
         store_floats(self, "lower", "upper")
         axes = dimensions(self.lower), dimensions(self.upper)
-        if axes in ((0, 1), (1, 0)):
+        if axes in ((0, 1), (1, 0), (0, 2), (2, 0)):
             one, other = ("lower", "upper") if axes[0] == 0 else ("upper", "lower")
-            self._fill(one, np.shape(as_array(getattr(self, other))))
+            self._fill(one, np.shape(as_array(getattr(self, other)))[-1:])
 
     def _fill(self, name: str, shape: tuple[int, ...]) -> None:
         value = getattr(self, name)

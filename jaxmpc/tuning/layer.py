@@ -48,10 +48,11 @@ class MPCLayer:
     Arguments:
         mpc: The problem; what is not learned stays as it is here.
         learn: Names of fields of the problem: "Q", "R", "terminal_cost", "stage_weights", …, with a
-            dot those of its parts, "inputs.upper", "soft.rho"; "A", "B", "c" of the system. Or a
-            mapping of such names to a `Parameter`, which says the domain, the start and the entries
-            that are trained. Without one Q, R and other weights stay diagonal where they are, and
-            positive definite; penalties stay positive; all else is real.
+            dot those of its parts, "inputs.upper", "soft.rho"; "A", "B", "c" of the system. They
+            may differ from step to step. Or a mapping of such names to a `Parameter`, which says
+            the domain, the start and the entries that are trained. Without one Q, R and other
+            weights stay diagonal where they are, and positive definite; penalties stay positive;
+            all else is real.
         solver: Settings of the solver: `smoothing` for derivatives that see limits before they are
             reached, `eps`, and so on.
 
@@ -156,7 +157,7 @@ def _at(mpc: MPC, name: str) -> np.ndarray:
 def _parameter(name: str, value: np.ndarray) -> Parameter:
     """Return the parameter that starts at the value, in the domain of its field."""
     field = _path(name)[-1]
-    if field in MATRICES and value.ndim == 2:
+    if field in MATRICES and value.ndim >= 2:
         return Parameter(value, "diagonal" if is_diagonal(value) else "definite")
     return Parameter(value, "positive" if field in (*MATRICES, *POSITIVE) else "real")
 

@@ -9,7 +9,8 @@ An optimiser moves free real numbers θ; `values` maps them to what the problem 
     definite   V = L L', L lower triangular with θ below and exp(θ) on the diagonal: every
                symmetric positive definite V has exactly one such L (Golub & Van Loan 2013, §4.2.3)
 
-so that a step of θ is a relative change of a weight, independent of its units.
+so that a step of θ is a relative change of a weight, independent of its units. Matrices may have a
+leading axis: one for each step, each in the domain.
 """
 
 from collections.abc import Mapping
@@ -31,12 +32,13 @@ DOMAINS = ("real", "positive", "interval", "diagonal", "definite")
 class Parameter:
     """One quantity to tune: its initial value, its domain, and which of its entries are trained.
 
-    value: a number or an array; for "diagonal" and "definite" a matrix (n, n), for "diagonal" also
-    its diagonal (n,). domain: see above. lower, upper: ends of an "interval", numbers or arrays of
-    the value's shape. train: True, False, or a mask of the shape of what is free: of value itself,
-    of the diagonal (n,) for "diagonal", of L (n, n) for "definite" (its upper triangle does not
-    count). Entries not trained keep their value, up to rounding. Raises ValueError for values
-    outside the domain.
+    value: a number or an array; for "diagonal" and "definite" a matrix (n, n), or one for each of N
+    steps, (N, n, n), for "diagonal" also its diagonal (n,). domain: see above. lower, upper: ends
+    of an "interval", numbers or arrays of the value's shape. train: True, False, or a mask of the
+    shape of what is free: of value itself, of the diagonal (n,) for "diagonal", of L (n, n) for
+    "definite" (its upper triangle does not count), with a leading axis N where the value has one.
+    Entries not trained keep their value, up to rounding. Raises ValueError for values outside the
+    domain.
     """
 
     value: Any
@@ -53,9 +55,11 @@ class Parameter:
         if self.domain in ("diagonal", "definite"):
             if self.domain == "diagonal" and value.ndim == 1:
                 value = np.diag(value)
-            if value.ndim != 2 or value.shape[0] != value.shape[1]:
-                fail("value", f"shape {value.shape}", "Give a square matrix")
-            require_symmetric_psd("value", value, definite=True)
+            if value.ndim not in (2, 3) or value.shape[-2] != value.shape[-1]:
+                fail("value", f"shape {value.shape}", "Give a square matrix, or one for each step")
+            for k, matrix in enumerate(value.reshape(-1, *value.shape[-2:])):
+                name = "value" if value.ndim == 2 else f"value[{k}]"
+                require_symmetric_psd(name, matrix, definite=True)
             if self.domain == "diagonal" and not is_diagonal(value):
                 fail("value", "is not diagonal", 'Use the domain "definite"')
         if self.domain == "positive" and not np.all(value > 0):
@@ -88,10 +92,10 @@ class Parameter:
         if self.domain == "interval":
             return np.log(value - self.lower) - np.log(self.upper - value)
         if self.domain == "diagonal":
-            return np.log(np.diag(value))
+            return np.log(np.diagonal(value, axis1=-2, axis2=-1))
         if self.domain == "definite":
-            L = np.linalg.cholesky((value + value.T) / 2)
-            return np.tril(L, -1) + np.diag(np.log(np.diag(L)))
+            L = np.linalg.cholesky((value + value.swapaxes(-1, -2)) / 2)
+            return np.tril(L, -1) + _diagonal(np.log(np.diagonal(L, axis1=-2, axis2=-1)))
         return value
 
     def record(self) -> dict[str, Any]:
@@ -121,10 +125,11 @@ class Parameter:
             lower, upper = (jnp.asarray(end, raw.dtype) for end in (self.lower, self.upper))
             return lower + (upper - lower) * jax.nn.sigmoid(theta)
         if self.domain == "diagonal":
-            return jnp.diag(jnp.exp(theta))
+            return _diagonal(jnp.exp(theta))
         if self.domain == "definite":
-            L = jnp.tril(theta, -1) + jnp.diag(jnp.exp(jnp.diag(theta)))
-            return jnp.matmul(L, L.T, precision="highest")
+            scales = jnp.exp(jnp.diagonal(theta, axis1=-2, axis2=-1))
+            L = jnp.tril(theta, -1) + _diagonal(scales)
+            return jnp.matmul(L, L.swapaxes(-1, -2), precision="highest")
         return theta
 
 
@@ -132,8 +137,13 @@ Parameters = Mapping[str, Parameter]
 
 
 def is_diagonal(M: np.ndarray) -> bool:
-    """Return whether a square matrix has no entry beside its diagonal."""
-    return bool(np.all(M == np.diag(np.diag(M))))
+    """Return whether a square matrix, or each of several, has no entry beside its diagonal."""
+    return bool(np.all(M[..., ~np.eye(M.shape[-1], dtype=bool)] == 0))
+
+
+def _diagonal(v: Any) -> Any:
+    """Return the diagonal matrices (…, n, n) of the vectors (…, n)."""
+    return v[..., None] * np.eye(v.shape[-1], dtype=v.dtype)
 
 
 def require_parameters(parameters: Parameters) -> None:

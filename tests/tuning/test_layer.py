@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from scipy.optimize import approx_fprime
 
@@ -129,3 +130,73 @@ def test_refuses_other_parameters(layer):
         layer({"Q": jnp.zeros(3)}, np.zeros(2))
     with pytest.raises(ValueError, match="holds traced arrays"):
         jax.jit(lambda Q: jm.tuning.MPCLayer(jm.MPC(MPC.system, Q, np.eye(1), 3)).init())(np.eye(2))
+
+
+def varying():
+    """Return a problem with weights, dynamics and limits of each step."""
+    random = np.random.default_rng(0)
+    M = random.normal(size=(4, 2, 2))
+    return jm.MPC(
+        jm.LinearSystem(A + 0.05 * random.normal(size=(4, 2, 2)), B),
+        M @ M.transpose(0, 2, 1) + np.eye(2),
+        np.array([1.0, 0.5, 2.0, 1.0]),
+        horizon=4,
+        states=jm.Box([-1, -1], [1, 1]),
+        inputs=jm.Box(-0.5, np.array([[0.5], [0.4], [0.3], [0.2]])),
+    )
+
+
+STEPWISE = ("Q", "R", "A", "inputs.upper")
+
+
+def test_what_differs_from_step_to_step_stays_in_its_domain(x64):
+    mpc = varying()
+    layer = jm.tuning.MPCLayer(mpc, STEPWISE)
+    theta = layer.init()
+    assert {name: v.shape for name, v in theta.items()} == {
+        "Q": (12,), "R": (4,), "A": (16,), "inputs.upper": (4,),
+    }  # fmt: skip
+    found = layer.values(theta)
+    for name, value in (("Q", mpc.Q), ("R", mpc.R), ("A", mpc.system.A)):
+        np.testing.assert_allclose(found[name], value, rtol=1e-14, atol=1e-14)
+    moved = layer.values(jax.tree.map(lambda v: v - 2.0, theta))
+    assert np.all(np.linalg.eigvalsh(moved["Q"]) > 0)
+    np.testing.assert_allclose(moved["R"], np.exp(-2.0) * mpc.R)
+    flat = np.where(np.arange(4)[:, None, None] == 2, 0.0, mpc.Q)
+    with pytest.raises(ValueError, match=r"value\[2\]: is not positive definite"):
+        jm.Parameter(flat, "definite")
+
+
+@pytest.mark.slow
+def test_weights_and_models_of_each_step_are_learned(x64):
+    """From plans of a problem whose steps differ; derivatives beside differences."""
+    mpc = varying()
+    x = np.random.default_rng(1).uniform(-0.6, 0.6, (32, 2))
+    plans = jax.vmap(jm.Controller(mpc).plan)(jnp.asarray(x)).inputs
+    one = jm.tuning.MPCLayer(
+        jm.MPC(
+            jm.LinearSystem(np.tile(A, (4, 1, 1)), B), np.tile(np.eye(2), (4, 1, 1)), np.ones(4), 4,
+            mpc.states, mpc.inputs,
+        ),
+        ("Q", "R", "A"),
+    )  # fmt: skip
+
+    @jax.jit
+    @jax.value_and_grad
+    def loss(theta):
+        return jnp.mean((jax.vmap(one, (None, 0))(theta, x).plan.inputs - plans) ** 2)
+
+    theta = one.init()
+    value, gradient = loss(theta)
+    for name, slope in gradient.items():
+        for i in range(0, len(slope), 3):
+            step = 1e-5 * np.eye(len(slope))[i]
+            ends = [float(loss(theta | {name: theta[name] + s * step})[0]) for s in (1, -1)]
+            np.testing.assert_allclose(slope[i], (ends[0] - ends[1]) / 2e-5, rtol=1e-4, atol=1e-8)
+    optimizer = optax.adam(0.05)
+    state = optimizer.init(theta)
+    for _ in range(300):
+        now, gradient = loss(theta)
+        step, state = optimizer.update(gradient, state)
+        theta = optax.apply_updates(theta, step)
+    assert now < 1e-3 * value
