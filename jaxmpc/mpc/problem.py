@@ -1,6 +1,6 @@
 """The constrained MPC problem as a user states it, and the same one with soft or hard limits."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from typing import Any, NamedTuple, TypeVar
@@ -35,6 +35,7 @@ from jaxmpc.sets.limits import output_limits
 from jaxmpc.systems.system import LinearSystem, host_matrices
 
 T = TypeVar("T")
+Stages = Callable[[], tuple[int, ...]]
 
 # Curvature of the cost, relative to its terms, below which a direction of the inputs costs nothing.
 FLAT = 1e-12
@@ -347,9 +348,10 @@ class MPC:
             require_shape("stage_weights", s, (N,), "One number for each k = 0..N−1")
             if concrete(s) and not (np.all(np.isfinite(s)) and np.all(np.asarray(s) >= 0)):
                 fail("stage_weights", f"{np.asarray(s).tolist()}", "Give numbers of at least 0")
-        sets: tuple[tuple[str, tuple[type, ...], int, tuple[int, ...] | None], ...] = (
-            ("states", (Box, Polytope), n, self.state_stages),
-            ("inputs", (Box, Polytope), m, tuple(range(self.horizon))),
+        every = lambda: tuple(range(self.horizon))
+        sets: tuple[tuple[str, tuple[type, ...], int, Stages | None], ...] = (
+            ("states", (Box, Polytope), n, lambda: self.state_stages),
+            ("inputs", (Box, Polytope), m, every),
             ("terminal_set", (Box, Polytope, Ellipsoid), n, None),
         )
         for name, kinds, size, stages in sets:
@@ -372,13 +374,9 @@ class MPC:
             for what, weight in (("rho", soft.rho), ("quadratic", soft.quadratic)):
                 name = f"soft[{i}].{what}"
                 require_real(name, weight)
-                rows = np.shape(as_array(soft.C))[-2]
-                if np.shape(as_array(weight)) not in (
-                    (),
-                    (rows,),
-                    (len(soft_stages(self, soft)), rows),
-                ):
-                    fail(name, f"shape {np.shape(as_array(weight))}", "One number, or one a row")
+                shape, rows = np.shape(as_array(weight)), np.shape(as_array(soft.C))[-2:-1]
+                if shape != () and (len(shape) > 2 or shape[-1:] != rows):
+                    fail(name, f"shape {shape}", "One number, or one a row")
                 require_finite(name, weight)
                 if concrete(weight) and np.any(np.asarray(weight) < 0):
                     fail(name, f"{weight}", "Penalties are at least 0")
@@ -472,7 +470,7 @@ class MPC:
         last = self.horizon - (rows.D is not None)
         _require_stages(f"{name}.stages", rows.stages, last)
         find: Any = soft_stages if isinstance(rows, Soft) else output_stages
-        for where, part in _stage_by_stage(name, rows, find(self, rows)):
+        for where, part in _stage_by_stage(name, rows, lambda: find(self, rows)):
             self._validate_rows_at(where, part)
 
     def _validate_rows_at(self, name: str, rows: Soft | Outputs) -> None:
@@ -512,7 +510,8 @@ class MPC:
                 fail("input_rate_weight", f"shape {np.shape(W)}", f"Give ({m}, {m}) or ({m},)")
             self._require_weight("input_rate_weight", m, "One row for each input")
         if isinstance(limit, Box):
-            for where, part in _stage_by_stage("input_rate_limit", limit, range(self.horizon)):
+            every = lambda: tuple(range(self.horizon))
+            for where, part in _stage_by_stage("input_rate_limit", limit, every):
                 part.validate(where, m)
         elif limit is not None:
             if concrete(limit):
@@ -653,16 +652,16 @@ def _require_stages(name: str, stages: Any, last: int) -> None:
         fail(name, f"{stages!r}", f"Give a tuple of different stages from 0 to {last}")
 
 
-def _stage_by_stage(
-    name: str, part: Any, stages: Sequence[int] | None
-) -> Iterator[tuple[str, Any]]:
+def _stage_by_stage(name: str, part: Any, at: Stages | None) -> Iterator[tuple[str, Any]]:
     """Yield a set, or rows, with the name for errors: at each of its stages where it differs from
-    one to the next (what is traced at the first alone, for its shapes), else once. stages: None for
-    a set that may not differ. Raises ValueError for a leading axis of another length."""
-    names = differing(part) if stages is not None else ()
-    if stages is None or not names:
+    one to the next (what is traced at the first alone, for its shapes), else once. at: gives the
+    stages, None for a set that may not differ. Raises ValueError for a leading axis of another
+    length."""
+    names = differing(part)
+    if at is None or not names:
         yield name, part
         return
+    stages = at()
     for field in names:
         shape = np.shape(as_array(getattr(part, field)))
         if shape[0] != len(stages):

@@ -83,6 +83,19 @@ class TestRegions:
         x[:2] = np.nan, np.inf
         assert list(found.find(x[:2])) == [-1, -1]
 
+    def test_steps_that_differ(self):
+        """Dynamics, weights and limits are others at each step."""
+        mpc, random = problems.lecture(0.25, 3), np.random.default_rng(0)
+        each = lambda M: np.asarray(M) * random.uniform(0.9, 1.1, (3, *np.shape(M)))
+        mpc = replace(
+            mpc, system=jm.LinearSystem(each(mpc.system.A), each(mpc.system.B)),
+            Q=np.linspace(1, 3, 3)[:, None, None] * np.asarray(mpc.Q),
+            inputs=jm.Box(mpc.inputs.lower, each(mpc.inputs.upper)),
+        )  # fmt: skip
+        found = critical_regions(mpc)
+        assert found.complete and len(found) > 5
+        assert kkt(mpc, found) < 1e-9
+
     def test_prestabilised(self):
         """u_0 counts the prestabilising gain; the regions do not depend on it."""
         mpc = problems.unstable(6)

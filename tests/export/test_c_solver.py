@@ -32,6 +32,17 @@ def pendulum(**changes):
     )  # fmt: skip
 
 
+def differing():
+    """Dynamics, weights and limits are others at each step."""
+    mpc, random = pendulum(), np.random.default_rng(0)
+    each = lambda M, size: np.asarray(M) + size * random.uniform(-1, 1, (5, *np.shape(M)))
+    system = jm.LinearSystem(each(mpc.system.A, 0.1), each(mpc.system.B, 0.05), mpc.system.c)
+    Q = np.linspace(1, 3, 5)[:, None, None] * np.eye(2)
+    inputs = jm.Box(mpc.inputs.lower, each(mpc.inputs.upper, 0.4))
+    states = jm.Box(each(mpc.states.lower, 0.1), mpc.states.upper)
+    return replace(mpc, system=system, Q=Q, states=states, inputs=inputs)
+
+
 CASES = {
     "hard": (lambda: problems.joint_o_inf(6), STEPS),
     "all": (
@@ -53,6 +64,7 @@ CASES = {
     ),
     "moves": (lambda: pendulum(control_horizon=(1, 2, 2)), STEPS),
     "schedule": (pendulum, jm.ADMM(iterations=12, newton_steps=0, rho=[[0.3], [2.0]])),
+    "steps that differ": (differing, STEPS),
     "no rows": (lambda: pendulum(states=None, inputs=None), STEPS),
 }  # fmt: skip
 
@@ -95,6 +107,7 @@ def test_closed_loop_is_the_controllers(case, tmp_path):
     with jax.enable_x64(True):
         code, law = Compiled(mpc, solver, tmp_path), jm.Controller(mpc, solver)
         system = law.mpc.system
+        A, B = (np.asarray(v)[0] if v.ndim == 3 else np.asarray(v) for v in (system.A, system.B))
         for start, reference, effort in ((0.5, None, None), (1.2, 0.3, 0.1)):
             x, control = np.full(system.n, start), None
             code.memory[:] = 0
@@ -107,7 +120,7 @@ def test_closed_loop_is_the_controllers(case, tmp_path):
                 control = law(x, control, aim[0], input_reference=aim[1])
                 mine, _ = code.step(x, target, input_target)
                 np.testing.assert_allclose(mine, control.u, rtol=0, atol=1e-8)
-                x = np.asarray(system.A) @ x + np.asarray(system.B) @ mine
+                x = A @ x + B @ mine
                 x = x if system.c is None else x + np.asarray(system.c)
 
 
