@@ -49,7 +49,9 @@ def export_c(
     itself. Choose iterations and rho with `choose_steps` or `tune_solver`, and see what they reach
     with `check_fixed_steps`.
 
-    References are constant over the horizon. Inputs in a Box are clipped into it.
+    References are constant over the horizon. Inputs in a Box are clipped into it. Of a system that
+    differs from step to step the inputs themselves are the variables: no gain for each step keeps
+    long predictions of unstable ones well-conditioned.
 
     folder: where NAME.c, NAME.h, NAME_sizes.h, NAME_tables.h and NAME_example.c are written. dtype:
     type of all numbers there; the tables are computed in float64. tolerance: of the residuals
@@ -65,6 +67,9 @@ def export_c(
     files = CFiles.open(folder, name, dtype, tolerance, TOLERANCE, overwrite)
     with jax.enable_x64(True):
         controller = Controller(mpc, replace(solver, newton_steps=0))
+        if controller.condensed.K.ndim == 3:  # a plan is shifted in the variables of one gain
+            mpc = replace(mpc, prestabilise=False)
+            controller = Controller(mpc, controller.solver)
         assert controller.factor is not None
         fault = Status(int(controller.factor.fault))
         if fault != Status.NOT_RUN:

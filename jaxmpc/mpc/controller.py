@@ -173,7 +173,7 @@ class Controller:
         """
         c = self.condensed
         start = WarmStart.of(plan, c.layout, self.mpc)
-tail = within_limits(self.mpc, matmul(c.K_N, start.states[-1]), start.inputs[-1])
+        tail = within_limits(self.mpc, matmul(c.K_N, start.states[-1]), start.inputs[-1])
         return start.shifted(c.layout, tail, bool(c.balls))
 
     def plan(

@@ -288,13 +288,13 @@ def answer(
     )
 
 
-def limited(inputs: Any, u: Array, stage: int = 0) -> Array:
-    """Return u clipped into the input limits of a stage, if these are a Box: no rounding beyond
-    them."""
+def limited(inputs: Any, u: Array) -> Array:
+    """Return u clipped into the input limits of the first stage, if these are a Box: no rounding
+    beyond them."""
     if not isinstance(inputs, Box):
         return u
-    here = at_stage(inputs, stage)
-    return _between(u, here.lower, here.upper)
+    first = at_stage(inputs, 0)
+    return _between(u, first.lower, first.upper)
 
 
 def rate_ends(mpc: MPC) -> tuple[Any, Any]:

@@ -40,7 +40,8 @@ def differing():
     Q = np.linspace(1, 3, 5)[:, None, None] * np.eye(2)
     inputs = jm.Box(mpc.inputs.lower, each(mpc.inputs.upper, 0.4))
     states = jm.Box(each(mpc.states.lower, 0.1), mpc.states.upper)
-    return replace(mpc, system=system, Q=Q, states=states, inputs=inputs)
+    same = {"prestabilise": False}  # as C code has it
+    return replace(mpc, system=system, Q=Q, states=states, inputs=inputs, **same)
 
 
 CASES = {
