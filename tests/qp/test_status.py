@@ -61,6 +61,20 @@ def rescaled(program, rng, decades):
     return P * unit * unit[:, None], q * unit, row[:, None] * A * unit, row * l, row * u
 
 
+def off_optimal(program, z, y):
+    """The largest residual of the conditions of optimality of a program rounded to float32, each
+    relative to the sum of its absolute terms."""
+    P, q, A, l, u = (np.asarray(np.float32(part), float) for part in program)
+    v, size = A @ z, np.abs(A) @ np.abs(z)
+    gradient = P @ z + q + A.T @ y
+    terms = np.abs(P) @ np.abs(z) + np.abs(q) + np.abs(A).T @ np.abs(y)
+    ends = np.where(y > 0, u, np.where(y < 0, l, v))  # a row with a multiplier is at its bound
+    apart = np.abs(v - ends) * np.abs(y) / (np.abs(z) @ terms)
+    return max(
+        np.max(np.maximum(l - v, v - u) / size), np.max(np.abs(gradient) / terms), np.max(apart)
+    )
+
+
 @PRECISIONS
 @pytest.mark.parametrize("decades", [12, 0, 4])
 @pytest.mark.parametrize("make", [bounded, unbounded, empty])
@@ -77,7 +91,15 @@ def test_no_false_status_in_any_units(make, decades, x64):
     rng = np.random.default_rng(7)
     with jax.enable_x64(x64):
         qps = [rescaled(make(rng), rng, decades) for _ in range(COUNT)]
-        status = np.asarray(solve(batch(qps, float if x64 else np.float32)).status)
+        found = solve(batch(qps, float if x64 else np.float32))
+    status = np.asarray(found.status)
+    if make is unbounded and not x64:
+        # Data rounded to float32 have a curvature of 1e-8 along d: some programs have a solution.
+        for i in np.flatnonzero(status == jm.Status.SOLVED):
+            assert (
+                off_optimal(qps[i], *(np.asarray(v[i], float) for v in (found.z, found.y))) < 1e-5
+            )
+        allowed = (*allowed, jm.Status.SOLVED)
     assert set(status) <= {*allowed, jm.Status.ITERATION_LIMIT, jm.Status.INACCURATE}
     if x64 and decades < 12:
         assert np.mean(np.isin(status, allowed)) >= 0.95
@@ -94,7 +116,8 @@ def test_a_small_coefficient_still_bounds(x64, least):
     with jax.enable_x64(x64):
         some = [programs[i % len(programs)] for i in range(50)]  # and the program of the last test
         status = solve(batch(some, float if x64 else np.float32)).status
-    assert np.isin(status, [jm.Status.SOLVED, jm.Status.ITERATION_LIMIT]).all()
+    undecided = jm.Status.ITERATION_LIMIT, jm.Status.INACCURATE
+    assert np.isin(status, [jm.Status.SOLVED, *undecided]).all()
 
 
 @PRECISIONS
