@@ -1,18 +1,17 @@
 """What the calls that people make take, from NumPy arrays to NumPy arrays.
 
     python experiments/user_calls.py [--states 1048576]   # labels and plans of the joint
-    python experiments/user_calls.py --devices 2          # the same on one device and on two
     python experiments/user_calls.py --first              # the first calls of a process
 
-The least of several calls, after one that compiles. "Kept": of a `FeasibilityProblem` or a
-`Controller` that was made before; "fresh": of the `MPC` itself. --first gives CPU seconds, of all
-threads, which other work on the machine changes less than the time of day.
+Several devices: `many_devices.py`. The least of several calls, after one that compiles. "Kept": of
+a `FeasibilityProblem` or a `Controller` that was made before; "fresh": of the `MPC` itself. --first
+gives CPU seconds, of all threads, which other work on the machine changes less than the time of
+day.
 """
 
 import argparse
 import time
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import jax
@@ -51,32 +50,6 @@ def print_calls(states: int) -> None:
     report("plans, left on the device", left, states)
 
 
-def print_devices(states: int, most: int) -> None:
-    """Print how much faster `most` devices are than one."""
-    mpc, x = joint(), uniform(states)
-    problem = jm.map_feasible_set(mpc, x).problem
-    feasible = np.asarray(family("joint", states)[1])
-    with jax.enable_x64(True):
-        controller = jm.Controller(mpc)
-
-    def labels(devices: int) -> Any:
-        return jm.map_feasible_set(problem, x, devices=devices).label
-
-    def plans(devices: int, to_host: bool) -> Any:
-        found = jm.solve_many(controller, feasible, devices=devices, to_host=to_host)
-        return jax.block_until_ready(found)
-
-    calls: dict[str, Callable[[int], Any]] = {
-        "labels": labels,
-        "plans": lambda devices: plans(devices, True),
-        "plans, left on the devices": lambda devices: plans(devices, False),
-    }
-    for name, call in calls.items():
-        one = report(f"{name}, 1 device", partial(call, 1), states)
-        many = report(f"{name}, {most} devices", partial(call, most), states)
-        print(f"{name}: {most} devices {one / many:.2f} times as fast as one", flush=True)
-
-
 def print_first_calls() -> None:
     """Print the CPU seconds of the first `solve`, and of the first value and gradient of a loss."""
     mpc = joint()
@@ -106,14 +79,11 @@ def main() -> None:
         description=summary, epilog=text, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--states", type=int, default=2**20)
-    parser.add_argument("--devices", type=int, help="compare so many devices with one")
     parser.add_argument("--first", action="store_true", help="time first calls")
     given = parser.parse_args()
     print(jax.__version__, jax.local_devices(), flush=True)
     if given.first:
         print_first_calls()
-    elif given.devices:
-        print_devices(given.states, given.devices)
     else:
         print_calls(given.states)
 

@@ -62,13 +62,16 @@ class Compiled:
 
     def run(self, *args: Any) -> Any:
         """Return the result, left on the device, or on the devices as a batch."""
+        parts = self.parts(*args)
+        return parts[0] if len(parts) == 1 else jax.tree.map(self._assembled, *parts)
+
+    def parts(self, *args: Any) -> list[Any]:
+        """Return what each device has of the result."""
         shares = self.shares(args)
         programs = self._programs(shares)
-        if len(shares) == 1:
-            return programs[0](*shares[0])
         # A program with a loop whose end depends on the data keeps its thread until the end.
-        parts = side_by_side(lambda i: programs[i](*shares[i]), range(len(shares)), len(shares))
-        return jax.tree.map(self._assembled, *parts)
+        run = lambda i: programs[i](*shares[i])
+        return side_by_side(run, range(len(shares)), len(shares))
 
     def shares(self, args: tuple) -> list[tuple]:
         """Return the arguments that each device gets: host arrays go to all of them at once."""
@@ -98,6 +101,7 @@ class Compiled:
         with self._compiles:  # threads that need the same program wait for one of them
             if key not in self.programs:
                 start = time.perf_counter()
+                # Traced and lowered once; XLA compiles for each device.
                 lowered = [self.function.lower(*share) for share in shares]
                 compiled = side_by_side(lambda each: each.compile(), lowered, len(lowered))
                 self.programs[key] = compiled
@@ -117,6 +121,9 @@ class Compiled:
 def _share(v: Any, *, device: jax.Device, i: int, count: int, batched: bool) -> jax.Array:
     """Return part i of `count` of an array, or all of it where it is not batched, on its device."""
     if isinstance(v, jax.Array) and len(v.sharding.device_set) > 1:
+        own = v.addressable_data(i)  # in the order of the mesh; `addressable_shards` takes longer
+        if own.devices() == {device}:
+            return own
         return next(part.data for part in v.addressable_shards if part.device == device)
     size = len(v) // count if batched else 0
     return jax.device_put(v[i * size : (i + 1) * size] if batched else v, device)
@@ -238,13 +245,14 @@ CHUNK = 8192
 MANY = 100_000
 
 
-def default_chunk(numbers: int = 4096) -> int:
+def default_chunk(numbers: float = 4096, most: int = 128 * CHUNK) -> int:
     """Return how many points a compiled program takes at once on the present device. numbers: of
-    float64, that it holds of each; all of them take a quarter of the memory of a GPU at most."""
+    float64, that it holds of each; all of them take a quarter of the memory of a GPU at most.
+    most: points at once, elsewhere than on a CPU."""
     if jax.default_backend() == "cpu":
         return CHUNK
     fitting = device_bytes() / 4 / (8 * numbers)
-    return 2 ** int(np.log2(np.clip(fitting, CHUNK, 128 * CHUNK)))
+    return 2 ** int(np.log2(np.clip(fitting, CHUNK, most)))
 
 
 def cores() -> int:
@@ -296,20 +304,28 @@ def first_rows(tree: Any, count: int) -> Any:
     return jax.tree.map(lambda v: v[:count], tree)
 
 
-def joined(parts: Sequence[Any]) -> Any:
-    """The host arrays of pytrees one after the other, copied by as many threads as there are cores:
-    a single one is slower than a fast device."""
+def joined(parts: Sequence[Any], out: Any = None) -> Any:
+    """Return the host arrays of pytrees one after the other, copied by several threads: a single
+    one is slower than a fast device. out: arrays to write into, in place of new
+    ones; what goes beyond their end is left out."""
     leaves = list(zip(*map(jax.tree.leaves, parts), strict=True))  # the parts of each
-    whole = [np.empty((sum(map(len, vs)), *vs[0].shape[1:]), vs[0].dtype) for vs in leaves]
-    copies = [
-        (out[end - len(v) : end], v)
-        for out, vs in zip(whole, leaves, strict=True)
-        for end, v in zip(np.cumsum([len(v) for v in vs]), vs, strict=True)
-    ]
-    side_by_side(lambda pair: np.copyto(*pair), copies, cores())
+    if out is None:
+        whole = [np.empty((sum(map(len, vs)), *vs[0].shape[1:]), vs[0].dtype) for vs in leaves]
+    else:
+        whole = jax.tree.leaves(out)
+    copies = []
+    for here, vs in zip(whole, leaves, strict=True):
+        for end, v in zip(np.cumsum([len(v) for v in vs]), vs, strict=True):
+            rows = max(COPIED // max(v[:1].nbytes, 1), 1)
+            target = here[end - len(v) : end]
+            copies += [(target[some], v[: len(target)][some]) for some in slices(len(v), rows)]
+    large = sum(target.nbytes for target, _ in copies) > COPIED
+    side_by_side(lambda pair: np.copyto(*pair), copies, min(cores(), COPIERS) if large else 1)
     return jax.tree.unflatten(jax.tree.structure(parts[0]), whole)
 
 
+# Bytes that a thread copies at once, and the most threads, which take turns with all others.
+COPIED, COPIERS = 2**26, 32
 # Bytes of an array from which on it goes to the host through pinned memory.
 PINNED = 2**20
 
@@ -326,17 +342,22 @@ def host_parts(tree: T) -> list[T]:
     """Return `to_host` of a batch that lies on several devices device by device, in order, so that
     it need not be copied to be joined; of one device, or of other leaves, the whole."""
     leaves, structure = jax.tree.flatten(tree)
-    # All copies begin before the first is waited for.
-    begun = [_begin_copy(v) if isinstance(v, jax.Array) else v for v in leaves]
-    parts = [_parts(v) for v in begun]
+    parts = [_shards(v) for v in leaves]
     count = max(map(len, parts), default=1)
     if any(len(part) != count for part in parts):
-        parts, count = [[np.asarray(v)] for v in begun], 1
-    return [jax.tree.unflatten(structure, [part[i] for part in parts]) for i in range(count)]
+        parts, count = [[v] for v in leaves], 1
+    return host_copies([jax.tree.unflatten(structure, [v[i] for v in parts]) for i in range(count)])
+
+
+def host_copies(trees: list[T]) -> list[T]:
+    """Return these trees with leaves of NumPy. All copies begin before the first is waited for."""
+    begun = jax.tree.map(lambda v: _begin_copy(v) if isinstance(v, jax.Array) else v, trees)
+    return jax.tree.map(np.asarray, begun)
 
 
 def _begin_copy(v: jax.Array) -> jax.Array:
-    if v.nbytes >= PINNED and _has_pinned(next(iter(v.sharding.device_set))):
+    device = next(iter(v.sharding.device_set))
+    if v.nbytes >= PINNED and _has_pinned(device):
         return jax.device_put(v, v.sharding.with_memory_kind("pinned_host"))
     v.copy_to_host_async()
     return v
@@ -349,13 +370,13 @@ def _has_pinned(device: jax.Device) -> bool:
     return device.platform != "cpu" and "pinned_host" in kinds
 
 
-def _parts(v: Any) -> list[np.ndarray]:
-    """Return the parts of a batch on several devices, in order; else the whole."""
+def _shards(v: Any) -> list[Any]:
+    """Return the parts of a batch on several devices, in order, each of one; else the whole."""
     several = isinstance(v, jax.Array) and len(v.sharding.device_set) > 1
     if not several or v.sharding.is_fully_replicated:
-        return [np.asarray(v)]
+        return [v]
     shards = sorted(v.addressable_shards, key=lambda part: part.index[0].start or 0)
-    return [np.asarray(part.data) for part in shards]
+    return [part.data for part in shards]
 
 
 class Part(NamedTuple, Generic[R]):

@@ -118,6 +118,42 @@ def check_plans():
     assert solve(np.zeros((0, 2)), devices=2).inputs.shape == (0, 5, 1)
 
 
+def check_plans_left_there():
+    """Each device keeps an equal part of the plans, in order, however many pieces it takes."""
+    import jax
+
+    import jaxmpc as jm
+
+    x, mpc, solver = states(204), problem(), jm.ADMM(30, newton_steps=5)
+    solve = lambda x, **options: jm.solve_many(mpc, x, solver, dtype="float64", **options)
+    one, rows = solve(x), lambda tree, where: jax.tree.map(lambda v: v[where], tree)
+    solved = one.status == jm.Status.SOLVED
+    for chunk, devices in ((None, 4), (64, 4), (64, None)):
+        there = solve(x, chunk=chunk, devices=devices, to_host=False)
+        for leaf in jax.tree.leaves(there):
+            assert len(leaf.addressable_shards) == (devices or 1)
+            assert {len(part.data) for part in leaf.addressable_shards} == {204 // (devices or 1)}
+        host = jax.tree.map(np.asarray, there)
+        same(host.status, one.status)
+        near(rows(host, solved).inputs, rows(one, solved).inputs)
+    few = solve(x[:203], chunk=64, devices=4, to_host=False)  # whole on each
+    near(np.asarray(few.inputs)[solved[:203]], rows(one, slice(203)).inputs[solved[:203]])
+
+
+def check_large_results():
+    """Copies by several threads, into parts of arrays that are there."""
+    from jaxmpc.batches import COPIED, joined
+
+    parts = [
+        (np.random.default_rng(i).uniform(size=(COPIED // 40, 7)), np.arange(i)) for i in (5, 3)
+    ]
+    found = joined(parts)
+    same(found, tuple(np.concatenate(each) for each in zip(*parts, strict=True)))
+    out = np.zeros((len(found[0]) - 9, 7)), np.zeros(7, int)
+    joined(parts, out)
+    same(out, (found[0][:-9], found[1][:7]))
+
+
 def check_loops():
     """Each loop with a plant of its own, in chunks whose last one is filled up."""
     import jax

@@ -2,9 +2,9 @@
 
     python experiments/robots/speed.py                     # 64 arms, for a CPU
     python experiments/robots/speed.py --count 4096        # for a GPU
-    python experiments/robots/speed.py --count 16384 --devices 2 --no-pieces  # beside --devices 1
 
-Each piece of a control step is timed apart, as a loop of its own inside one program: physics (the
+Several devices: `experiments/many_devices.py`. Each piece of a control step is timed apart, as a
+loop of its own inside one program: physics (the
 control period of the plant with its joint limits), the linear models, the data of the plans (with
 ADMM steps their Riccati factorisation), the judgement of a plan, ADMM steps if any, the Newton and
 interior point steps from a cold start; then the closed loop whole, whose plans start from those of
@@ -24,7 +24,6 @@ import numpy as np
 import tyro
 
 import jaxmpc as jm
-from jaxmpc.batches import chosen_devices, over_devices, placement
 from jaxmpc.mpc.stagewise.solve import factor_stages, plan_stages
 
 
@@ -39,7 +38,6 @@ class Settings:
     repeats: int = 3
     pieces: bool = True
     loop: bool = True  # also the closed loop, whose compilation takes longest
-    devices: int = 1  # GPUs that share the robots of the closed loop
 
 
 def timed(function: Any, *args: Any, repeats: int) -> tuple[float, float]:
@@ -143,11 +141,8 @@ def run(settings: Settings) -> dict[str, Any]:
         loop = lambda c, x: jax.vmap(
             lambda x: jm.simulate(c, robot, x, steps, reference=reference, input_reference=inputs)
         )(x)
-        devices = chosen_devices(s.devices)
-        controller = jax.device_put(controller, placement(devices))
-        x0s = jax.device_put(x0s, placement(devices, True))
         start = time.perf_counter()
-        program = over_devices(loop, devices, (False, True)).program(controller, x0s)
+        program = jax.jit(loop).lower(controller, x0s).compile()
         compiled = time.perf_counter() - start
         walls = []
         for _ in range(s.repeats):

@@ -197,12 +197,6 @@ def hull_for(problem: FeasibilityProblem, points: float) -> Hull | None:
 
 
 @functools.cache
-def compiled_labels(devices: Devices) -> Compiled:
-    """Return the compiled labels: (hull, points (B, d)) → labels (B,)."""
-    return over_devices(jax.vmap(label, in_axes=(None, 0)), devices, (False, True))
-
-
-@functools.cache
 def compiled_verdicts(devices: Devices) -> Compiled:
     """Return the compiled plans: (p, hull, points (B, d)) → verdicts."""
     each = jax.vmap(verdict, in_axes=(None, None, 0))

@@ -11,10 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmpc.arrays import Reals, host_array
-from jaxmpc.batches import Part, chosen_devices, count, default_chunk, slices, work_off
+from jaxmpc.batches import Part, chosen_devices, count, default_chunk, joined, slices, work_off
 from jaxmpc.checks import fail, number, require_step_type, whole
 from jaxmpc.feasible import proofs
 from jaxmpc.feasible.hard_constraints import Axes, ExactData
+from jaxmpc.feasible.hull_labels import hull_for
 from jaxmpc.feasible.pipeline import Labels, OnDemand, Scope, labelled_parts
 from jaxmpc.feasible.policy_hull import policy_hull, policy_labels
 from jaxmpc.feasible.policy_problem import PolicyProblem, problem_of
@@ -29,6 +30,8 @@ from jaxmpc.sets.lp import power_of_two
 
 # Volumes are sums of rounded products; bounds are widened by more than that.
 VOLUME_ROUNDING = 1e-11
+# Points that a GPU takes at once where rays have found polytopes, which need little memory a point.
+HULL = 2**22
 # What refinement proves, and its dimensions in data sets.
 BOUNDS = {
     "bound_point": ("ray", "coordinate"),
@@ -372,7 +375,7 @@ def map_points(
     if isinstance(problem, PolicyProblem):
         return _map_policies(problem, points, settings)
     with ThreadPoolExecutor(1) as copies:
-        kept = copies.submit(np.array, points)  # while the device works
+        kept = copies.submit(joined, [points])  # while the device works
         chunks = label_chunks(problem, points, **settings)
         done = work_off(
             chunks, parts.append, len(points), unit="pt", progress=progress, deadline=deadline
@@ -418,15 +421,19 @@ def label_chunks(
     """
     points = np.asarray(points, np.float64)
     _require_points(problem, points)
+    before = problem.memory.get("points", 0)
+    total = before + len(points) if scope is None else scope.points
     if chunk is None:
         devices = count(chosen_devices(settings.get("devices")))
         held = 16 * sum(problem.rows.U.shape)  # vectors of rows and inputs
-        chunk = devices * default_chunk(held)
+        if jax.default_backend() != "cpu" and hull_for(problem, total) is not None:
+            chunk = devices * default_chunk(held / 4, HULL)
+        else:
+            chunk = devices * default_chunk(held)
     chunk = min(whole("chunk", chunk, 1), max(len(points), 1))
     places = slices(len(points), chunk)
     if scope is None:
-        before = problem.memory.get("points", 0)
         empty = problem.programs.bounding_box[0] is None
         scope = Scope.of(points, len(places), before, extent=empty)
-        problem.memory["points"] = before + len(points)
+        problem.memory["points"] = total
     yield from labelled_parts(problem, places, points.__getitem__, scope, chunk, **settings)

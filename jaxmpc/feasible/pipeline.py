@@ -53,7 +53,8 @@ from jaxmpc.batches import (
 from jaxmpc.checks import fail, require_step_type
 from jaxmpc.feasible.candidate_search import compiled_admm, compiled_check, compiled_newton
 from jaxmpc.feasible.condensed_rows import ConstraintRows, RowPrograms
-from jaxmpc.feasible.hull_labels import compiled_labels, compiled_verdicts, hull_for
+from jaxmpc.feasible.hull_labels import Hull, compiled_verdicts, hull_for
+from jaxmpc.feasible.hull_labels import label as label_by
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.proofs import Verdict
 from jaxmpc.pytrees import record
@@ -67,6 +68,8 @@ LONGER = 20
 # an equal share, and no more than these entries of their matrices in total. 10,000 entries take
 # some tens of milliseconds.
 MOST_PROGRAMS, MOST_ENTRIES = 2000, 2 * 10**7
+# Points that a hull leaves undecided which go on at once: they are few.
+LEFT = 4096
 # Proofs of up to so many bytes in total stay on the device until they are used.
 ON_DEVICE = 2**31
 # Number of points from which their typical size is taken.
@@ -194,9 +197,10 @@ class Labels:
 
             return OnDemand(fetch)
 
+        label, status = joined([(part.label, part.status) for part in parts])
         return cls(
-            np.concatenate([part.label for part in parts]),
-            np.concatenate([part.status for part in parts]),
+            label,
+            status,
             {name: several(name) for name in PROOFS},
             sum(part.compile_seconds for part in parts),
             sum(part.run_seconds for part in parts),
@@ -307,11 +311,12 @@ def extent_of(points: np.ndarray) -> np.ndarray:
 
 class BegunPart(NamedTuple):
     """A part and, on the device, as programs take it: points x (whole, d), zeros where they are not
-    `usable`, of which the first are the part's; found: what the first stage has left there."""
+    `usable`, of which the first are the part's; found: what the first stage has left there, of the
+    hull labels and status, which say what is usable."""
 
     points: np.ndarray
     x: Array
-    usable: Array
+    usable: Array | None
     found: Any
 
 
@@ -345,12 +350,15 @@ class Pipeline:
         self.share = -(-programs // max(scope.parts, 1))
         self.whole = divisible(chunk, self.devices)  # the chunk as the devices share it
         each = gather_size(self.whole // count(self.devices))
+        hull = hull_for(problem, scope.points)
+        if hull is not None:
+            each = min(each, LEFT)
         self.batch = count(self.devices) * each
         self.short = compiled_admm(iterations, np.dtype(dtype), self.devices)
         self.long = compiled_admm(LONGER * iterations, np.dtype(np.float64), self.devices)
         self.newton = compiled_newton(each, self.devices)
         self.prepare, self.outcome = compiled_ends(self.devices)
-        data = exact, problem.rows, hull_for(problem, scope.points)
+        data = exact, problem.rows, hull
         with jax.enable_x64(True):
             self.exact, self.rows, self.hull = jax.device_put(data, placement(self.devices))
 
@@ -364,12 +372,11 @@ class Pipeline:
     def begin(self, points: np.ndarray) -> BegunPart:
         """Start the first stage of points (b, d), b ≤ chunk, on the device, and return at once."""
         full = points if len(points) == self.whole else padded(points, self.whole)
-        x, usable = self.prepare.run(full)
         if self.hull is not None:
-            found = _run(compiled_labels(self.devices), self.hull, x)
-        else:
-            found = _run(self.short, self.exact, self.rows, x)
-        return BegunPart(points, x, usable, found)
+            x, found = _run(compiled_hull(self.devices), self.hull, full)
+            return BegunPart(points, x, None, found)
+        x, usable = self.prepare.run(full)
+        return BegunPart(points, x, usable, _run(self.short, self.exact, self.rows, x))
 
     def finish(self, part: BegunPart) -> Labels:
         """Return the labels of a part, by all stages."""
@@ -378,7 +385,8 @@ class Pipeline:
             labels = self.by_newton(x, usable, found)
         else:
             verdict = OnDemand(functools.partial(self.hull_verdict, x))
-            labels = self.labels(found, usable, verdict.get)
+            label, status = to_host(found)
+            labels = Labels.proved(label, status, verdict.get)
         labels = labels.first(len(points))
         left = labels.undecided
         for stage in self.stages:
@@ -432,14 +440,11 @@ class Pipeline:
         return labels
 
     def decided(self, verdict: Verdict, usable: Any = None) -> Labels:
-        """Return the labels of a verdict; usable: which points are, None for all."""
+        """Return the labels of a verdict on the device, for which this waits; usable: which points
+        are, None for all."""
         usable = np.ones(len(verdict.label), bool) if usable is None else usable
-        return self.labels(verdict.label, usable, lambda: verdict)
-
-    def labels(self, label: Any, usable: Any, verdict: Callable[[], Verdict]) -> Labels:
-        """Return labels that lie on the device; waits for it."""
-        label, status = self.outcome(label, usable)
-        return Labels.proved(label, status, verdict)
+        label, status = self.outcome(verdict.label, usable)
+        return Labels.proved(label, status, lambda: verdict)
 
 
 @functools.cache
@@ -447,6 +452,18 @@ def compiled_ends(devices: Devices) -> tuple[Compiled, Compiled]:
     """Return the compiled `without_nan` and `outcome` of a batch."""
     prepare = over_devices(jax.vmap(without_nan), devices, (True,))
     return prepare, over_devices(jax.vmap(outcome), devices, (True, True))
+
+
+@functools.cache
+def compiled_hull(devices: Devices) -> Compiled:
+    """Return the compiled first stage by a hull: (hull, points (B, d)) → points, zeros where they
+    are not finite, and their labels and status."""
+
+    def stage(hull: Hull, theta: Array) -> tuple[Array, tuple[Array, Array]]:
+        x, usable = without_nan(theta)
+        return x, outcome(label_by(hull, x), usable)
+
+    return over_devices(jax.vmap(stage, (None, 0)), devices, (False, True))
 
 
 def _run(program: Compiled, *args: Any) -> Any:

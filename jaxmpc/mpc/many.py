@@ -16,7 +16,6 @@ it. That needs few coordinates.
 """
 
 import functools
-import itertools
 import threading
 from collections.abc import Sequence
 from contextlib import nullcontext
@@ -39,13 +38,12 @@ from jaxmpc.batches import (
     default_chunk,
     divisible,
     first_rows,
-    host_parts,
+    host_copies,
     joined,
     over_devices,
     padded,
     placement,
     side_by_side,
-    to_host,
     workers,
 )
 from jaxmpc.checks import fail, require_kind, require_memory, require_step_type, whole
@@ -104,9 +102,11 @@ def solve_many(
     coordinates solve some, and let the others follow these (top of this file). The status of each
     plan comes from its own residuals all the same: this changes the time, and which of several
     plans within the tolerances is found.
-    to_host: False leaves the plans on the device. devices: a number of them, or a sequence of JAX
-    devices, which share the states of a chunk; None: the default device. A state with NaN gets
-    status NON_FINITE. Raises ValueError for wrong shapes and ill-posed problems.
+    to_host: False leaves the plans on the device, without transfer. devices: a number of them, or a
+    sequence of JAX devices, which share the states of a chunk; None: the default device. Plans that
+    are left on several lie there in equal parts, in order, where the number of devices divides B;
+    else each device has all of them. A state with NaN gets status
+    NON_FINITE. Raises ValueError for wrong shapes and ill-posed problems.
     """
     if isinstance(mpc, Controller):
         problem = mpc.mpc
@@ -125,7 +125,7 @@ def solve_many(
         whole("chunk", chunk, 1)
     n, p = problem.system.n, problem.dimension
     if not (isinstance(x0s, Array) and x0s.dtype == np.float64):
-        x0s = host_array("x0s", x0s)
+        x0s = host_array("x0s", x0s, copy=False)
     if x0s.ndim != 2 or x0s.shape[1] not in (n, p):
         fail("x0s", f"shape {x0s.shape}", f"Give states (B, {n})")
     each = 8 * (problem.horizon + 1) * (n + problem.system.m)
@@ -169,7 +169,7 @@ class Batch:
         left = np.arange(B)
         # (On GPUs the solver's kernels take less time than the laws and the host's indices would.)
         on_cpu = jax.default_backend() == "cpu"
-        if transfer and on_cpu and B >= MANY and transferable(self.controller):
+        if transfer and self.to_host and on_cpu and B >= MANY and transferable(self.controller):
             self.chunk = self.block  # larger arrays a CPU's allocator would give back each time
             left = self._transfer()
         self._run(_plans(self.devices), (self.controller,), left)
@@ -206,47 +206,62 @@ class Batch:
     def _run(self, program: Compiled, arguments: tuple, index: np.ndarray) -> None:
         """Put the plans of program(*arguments, states) from the states at `index` (k,) into
         `answer`."""
-        size = self.chunk if len(index) >= self.chunk else self.block
-
-        def solved(where: np.ndarray) -> Plan:
-            if isinstance(self.x, np.ndarray):
-                x = padded(self.x[places(where)], size)
-            elif len(where) == len(self.x) == size:
-                x = self.x
-            else:
-                x = _rows(self.x, padded(where, size))
-            with self._begins:
-                return program.run(*arguments, x)
-
-        def put(where: np.ndarray) -> None:
-            plans = solved(where)
-            self._put(where, size, to_host(plans) if self.to_host else plans)
+        size = self.chunk if divisible(len(index), self.devices) >= self.chunk else self.block
+        pieces = [index[i : i + size] for i in range(0, len(index), size)]
 
         def parts(where: np.ndarray) -> list[Plan]:
-            return host_parts(solved(where))
+            with self._begins:
+                found = program.parts(*arguments, self._states(where, size))
+            return host_copies(found)
 
-        pieces = [index[i : i + size] for i in range(0, len(index), size)]
-        whole = len(index) == len(self.x)
-        # (On a CPU each chunk is copied at once, and its memory used again.)
-        if whole and len(pieces) == 1 and not self.to_host:
-            self.answer = first_rows(solved(index), len(index))
-        elif whole and self.to_host and (len(pieces) == 1 or jax.default_backend() != "cpu"):
-            found = list(itertools.chain(*side_by_side(parts, pieces, self.together)))
-            self.answer = first_rows(found[0] if len(found) == 1 else joined(found), len(index))
+        def put(where: np.ndarray) -> None:
+            self._put(where, parts(where))
+
+        if not self.to_host:
+            self.answer = self._left_there(program, arguments, size)
+        elif len(index) == len(self.x) <= size and self.devices is None:
+            self.answer = first_rows(parts(index)[0], len(index))
         else:
             side_by_side(put, pieces, self.together)
 
-    def _put(self, where: np.ndarray, size: int, plans: Plan) -> None:
-        B = len(self.x)
+    def _states(self, where: np.ndarray, size: int) -> Any:
+        """Return the states at these indices (k,), k ≤ size, filled up."""
+        if isinstance(self.x, np.ndarray):
+            return padded(self.x[places(where)], size)
+        return self.x if len(where) == len(self.x) == size else _rows(self.x, padded(where, size))
+
+    def _put(self, where: np.ndarray, plans: list[Plan]) -> None:
+        """Copy plans, in parts from each device, to these places of the answer on the host."""
         with self._stores:
             if self.answer is None:
-                zeros = np.zeros if self.to_host else jnp.zeros
-                self.answer = jax.tree.map(lambda v: zeros((B, *v.shape[1:]), v.dtype), plans)
-            if not self.to_host:
-                self.answer = _put(self.answer, padded(where, size), plans)
-                return
-        for all_, rows in zip(*map(jax.tree.leaves, (self.answer, plans)), strict=True):
-            all_[places(where)] = rows[: len(where)]
+                empty = lambda v: np.empty((len(self.x), *v.shape[1:]), v.dtype)
+                self.answer = jax.tree.map(empty, plans[0])
+        if isinstance(there := places(where), slice):
+            joined(plans, jax.tree.map(lambda v: v[there], self.answer))
+            return
+        found = plans[0] if len(plans) == 1 else joined(plans)
+        for all_, rows in zip(*map(jax.tree.leaves, (self.answer, found)), strict=True):
+            all_[there] = rows[: len(where)]
+
+    def _left_there(self, program: Compiled, arguments: tuple, size: int) -> Plan:
+        """Return the plans from all states, which lie on the devices: each has its part of the
+        states, in order, and takes `size` over their number at once."""
+        each = size // count(self.devices)
+        whole = divisible(len(self.x), self.devices)
+        x = self.x if len(self.x) == whole else padded(np.asarray(self.x), whole)
+        # The caller's array may change once this has returned.
+        x = jax.block_until_ready(jax.device_put(x, placement(self.devices, True), may_alias=False))
+        share = whole // count(self.devices)
+        if share == each:
+            return first_rows(program.run(*arguments, x), len(self.x))
+        piece = _piece(self.devices, each)
+        found = [program.run(*arguments, piece.run(i, x)) for i in range(0, share, each)]
+        structure = jax.tree.structure(found[0])
+        arrays = list(map(list, zip(*map(jax.tree.leaves, found), strict=True)))
+        found.clear()
+        for i in range(len(arrays)):  # an array of the pieces is given up as soon as it is copied
+            arrays[i] = _one_after_other(self.devices, share).run(arrays[i])
+        return first_rows(jax.tree.unflatten(structure, arrays), len(self.x))
 
 
 def numbers_held(controller: Controller) -> int:
@@ -267,9 +282,24 @@ def _rows(x: Array, where: Array) -> Array:
     return x[where]
 
 
-@partial(jax.jit, donate_argnums=0)
-def _put(answer: Plan, where: Array, plans: Plan) -> Plan:
-    return jax.tree.map(lambda v, rows: v.at[where].set(rows), answer, plans)
+@functools.cache
+def _piece(devices: Devices, size: int) -> Compiled:
+    """Return the program: (first, x) → so many rows of each device's part of x, from there on; the
+    last ones where fewer are left."""
+    rows = lambda first, x: jax.lax.dynamic_slice_in_dim(x, first, size)
+    return over_devices(rows, devices, (False, True))
+
+
+@functools.cache
+def _one_after_other(devices: Devices, total: int) -> Compiled:
+    """Return the program: results of such pieces → those of each device's part, so many rows."""
+
+    def join(pieces: list[Array]) -> Array:
+        *others, last = pieces
+        left = total - sum(map(len, others))
+        return jnp.concatenate([*others, last[len(last) - left :]])
+
+    return over_devices(join, devices, (True,))
 
 
 @functools.cache

@@ -69,7 +69,7 @@ def test_they_decide_nearly_all(always, monkeypatch):
     monkeypatch.setattr(pipeline, "_run", lambda *a: programs.append(a[0]) or run(*a))
     label = jm.map_feasible_set(mpc, points[np.abs(distance) > 1e-6], chunk=1000).label
     np.testing.assert_array_equal(label, np.where(distance < 0, 1, -1)[np.abs(distance) > 1e-6])
-    assert set(programs) <= {hull_labels.compiled_labels(None), hull_labels.compiled_verdicts(None)}
+    assert set(programs) <= {pipeline.compiled_hull(None), hull_labels.compiled_verdicts(None)}
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -88,7 +88,7 @@ def test_points_labelled_without_a_roll_out_have_plans(name):
     edges = np.linalg.inv(made.M)
     points = (made.center + np.einsum("fij,fkj->fki", edges, share)).reshape(-1, d)
     with jax.enable_x64(True):
-        label = np.asarray(hull_labels.compiled_labels(None).run(made, points))
+        label = np.asarray(pipeline.compiled_hull(None).run(made, points)[1][0])
         exact = problem.exact(np.abs(points).max(axis=0))
         found = jax.device_get(hull_labels.compiled_verdicts(None).run(exact, made, points))
     assert set(label) <= {-1, 0, 1} and np.all((found.label == label)[label != 0])
