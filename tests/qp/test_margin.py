@@ -36,8 +36,13 @@ def filled(qp) -> jm.QP:
     return rows(A, np.append(qp.l, -free), np.append(qp.u, free))
 
 
-def margin(qp, **settings) -> float:
-    t, status = jm.qp.feasibility_margin(qp, **settings)
+@jax.jit  # in one program, not in thirty small ones
+def margin_and_status(qp, scale, max_margin):
+    return jm.qp.feasibility_margin(qp, scale, max_margin)
+
+
+def margin(qp, scale=None, max_margin=1e3) -> float:
+    t, status = margin_and_status(qp, np.ones(len(qp.l)) if scale is None else scale, max_margin)
     assert status == jm.Status.SOLVED
     return float(t)
 
