@@ -35,7 +35,7 @@ from jaxmpc.sets.limits import output_limits
 from jaxmpc.systems.system import LinearSystem, host_matrices
 
 T = TypeVar("T")
-Stages = Callable[[], tuple[int, ...]]
+StagesOf = Callable[[], tuple[int, ...]]
 
 # Curvature of the cost, relative to its terms, below which a direction of the inputs costs nothing.
 FLAT = 1e-12
@@ -349,7 +349,7 @@ class MPC:
             if concrete(s) and not (np.all(np.isfinite(s)) and np.all(np.asarray(s) >= 0)):
                 fail("stage_weights", f"{np.asarray(s).tolist()}", "Give numbers of at least 0")
         every = lambda: tuple(range(self.horizon))
-        sets: tuple[tuple[str, tuple[type, ...], int, Stages | None], ...] = (
+        sets: tuple[tuple[str, tuple[type, ...], int, StagesOf | None], ...] = (
             ("states", (Box, Polytope), n, lambda: self.state_stages),
             ("inputs", (Box, Polytope), m, every),
             ("terminal_set", (Box, Polytope, Ellipsoid), n, None),
@@ -652,7 +652,7 @@ def _require_stages(name: str, stages: Any, last: int) -> None:
         fail(name, f"{stages!r}", f"Give a tuple of different stages from 0 to {last}")
 
 
-def _stage_by_stage(name: str, part: Any, at: Stages | None) -> Iterator[tuple[str, Any]]:
+def _stage_by_stage(name: str, part: Any, at: StagesOf | None) -> Iterator[tuple[str, Any]]:
     """Yield a set, or rows, with the name for errors: at each of its stages where it differs from
     one to the next (what is traced at the first alone, for its shapes), else once. at: gives the
     stages, None for a set that may not differ. Raises ValueError for a leading axis of another
