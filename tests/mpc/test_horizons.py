@@ -47,7 +47,7 @@ def test_a_batch_of_horizons_has_the_plans_of_each_alone(solve):
         np.testing.assert_allclose(plans.cost[i], alone.cost, rtol=1e-12)
 
 
-@pytest.mark.parametrize("blocks", [None, 2, (1, 2)])
+@pytest.mark.parametrize("blocks", [None, pytest.param((1, 2), marks=pytest.mark.slow)])
 def test_the_padded_program_is_the_same_in_the_moves_of_the_problem(blocks):
     """Hessian, linear terms and rows with a limit, without any solver."""
     mpc = problem(3, control_horizon=blocks)

@@ -25,7 +25,6 @@ EVERY = ("system.A", "system.B", "system.c", "Q", "R", "input_rate_weight", "sta
 LIMITS = ("states.lower", "states.upper", "inputs.upper", "outputs.C", "outputs.D")
 LIMITS += ("outputs.upper", "soft.C", "soft.upper", "soft.rho", "soft.quadratic")
 LIMITS += ("input_rate_limit",)
-SOLVERS = (jm.solve, solve_stagewise)
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -128,7 +127,9 @@ def by_hand(mpc, x0, before):
     return z[N * n : N * (n + m)].reshape(N, m), z @ P @ z / 2 + q @ z + constant
 
 
-@pytest.fixture(scope="module", params=SOLVERS, ids=("dense", "by stages"))
+@pytest.fixture(
+    scope="module", params=[pytest.param(jm.solve, marks=pytest.mark.slow), solve_stagewise]
+)
 def value(request):
     """Return the program mpc → ((a number made of the plan, the plan), its gradient)."""
     weights = np.random.default_rng(5).normal(size=(N, m))
@@ -176,6 +177,35 @@ def test_derivatives_are_those_of_differences(value):
         np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-8, err_msg=name)
 
 
+def test_the_condensed_program_is_the_problem():
+    """Its cost and rows, at random inputs, beside a roll-out step by step."""
+    mpc, rng = varying(soft=(), prestabilise=False), np.random.default_rng(4)
+    c, system = condense(mpc), mpc.system
+
+    def rolled_out(u):
+        x, before, J, rows = X0, BEFORE, 0.0, {name: [] for name in ("u", "x", "y", "rate")}
+        for k in range(N):
+            J += mpc.stage_weights[k] * (x @ mpc.Q[k] @ x + u[k] @ mpc.R[k] @ u[k])
+            J += (u[k] - before) @ mpc.input_rate_weight[k] @ (u[k] - before)
+            rows["u"] += [u[k]]
+            rows["x"] += [x]
+            rows["y"] += [mpc.outputs.C[k] @ x + mpc.outputs.D[k] @ u[k]]
+            rows["rate"] += [u[k] - before]
+            x, before = system.A[k] @ x + system.B[k] @ u[k] + system.c[k], u[k]
+        return J + x @ mpc.terminal_cost @ x, np.concatenate([np.ravel(v) for v in rows.values()])
+
+    theta, free = np.append(X0, BEFORE), np.zeros((N, m))
+    for u in rng.normal(size=(3, N, m)):
+        (J, rows), z = rolled_out(u), u.ravel()
+        value = z @ c.P @ z / 2 + (c.F @ theta + c.f) @ z
+        np.testing.assert_allclose(value, J - rolled_out(free)[0], rtol=1e-11)
+        np.testing.assert_allclose(c.C @ z + c.D @ theta + c.d, rows, atol=1e-12)
+    ends = [np.tile(mpc.inputs.lower, N), mpc.states.lower.ravel(), np.full(N, -np.inf)]
+    np.testing.assert_array_equal(c.lower, [*np.concatenate(ends), *-mpc.input_rate_limit.ravel()])
+    ends = [mpc.inputs.upper, mpc.states.upper, mpc.outputs.upper, mpc.input_rate_limit]
+    np.testing.assert_array_equal(c.upper, np.concatenate([np.ravel(v) for v in ends]))
+
+
 def test_constant_data_with_a_leading_axis_change_nothing():
     one = jm.MPC(
         jm.LinearSystem([[1.2, 0.1], [0, 1.1]], [[0.0], [0.1]], [0.01, 0]), np.eye(2), 0.1, 6,
@@ -195,7 +225,7 @@ def test_constant_data_with_a_leading_axis_change_nothing():
 def test_a_gain_for_each_step_changes_rounding_alone():
     mpc = varying(soft=(), outputs=())
     gains = 0.3 * np.random.default_rng(2).normal(size=(N, m, n))
-    plain, turned = (condense(replace(mpc, prestabilise=K)) for K in (False, gains))
+    plain, turned = (condense(replace(mpc, prestabilise=K)) for K in (0 * gains, gains))
     x, u = plain.trajectory(np.append(X0, BEFORE), np.linspace(-1, 1, N * m))
     z = turned.variables(x, u)
     np.testing.assert_allclose(turned.trajectory(np.append(X0, BEFORE), z)[0], x, atol=1e-13)
