@@ -1,4 +1,4 @@
-"""solve_many: the answers of `solve`, for every state, whatever the chunk."""
+"""solve_many: the best plans, which are those of `solve`, for every state, whatever the chunk."""
 
 import jax
 import numpy as np
@@ -33,6 +33,23 @@ def test_residuals_and_limits(plans):
     assert np.abs(plans.inputs[solved]).max() <= 2 + 1e-6
 
 
+def test_plans_are_the_best(plans, states):
+    """By non-negative least squares."""
+    mpc = problems.joint_o_inf(10)
+    some = np.flatnonzero(plans.status == jm.Status.SOLVED)[::17]
+    assert len(some) >= 10
+    for i in some:
+        inputs = problems.least_distance(mpc, states[i])
+        np.testing.assert_allclose(plans.inputs[i], inputs, atol=1e-5)
+        x, cost = states[i], 0.0
+        for u in inputs:
+            cost += x @ mpc.Q @ x + u @ mpc.R @ u
+            x = mpc.system.A @ x + mpc.system.B @ u
+        cost += x @ mpc.terminal_cost @ x
+        np.testing.assert_allclose(plans.cost[i], cost, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.slow
 def test_plans_are_those_of_solve(plans, states):
     mpc = problems.joint_o_inf(10)
     some = np.flatnonzero(plans.status == jm.Status.SOLVED)[::17]
