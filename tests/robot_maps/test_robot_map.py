@@ -261,7 +261,7 @@ def test_command_goes_on_where_it_was_stopped(tmp_path, monkeypatch, capsys):
     assert run(f"{line} --resume --lower -1 -1") == 2
     assert "lower" in capsys.readouterr().err
     assert run(f"{line} --resume") == 0
-    assert [len(points) for points in calls] == [8, 8, 8, 8], "the first chunk is kept"
+    assert [len(points) for points in calls] == [8, 8, 8, 4], "the first chunk is kept"
     assert run("verify out") == 0
     out = capsys.readouterr().out
     assert "predicted, failed" in out and "robot_map.png" in out
