@@ -119,7 +119,7 @@ def test_stored_programs():
         stored = export.export(jax.jit(function))(first, X0).serialize()
         plan = export.deserialize(stored).call(first, X0)
         np.testing.assert_allclose(plan.inputs, function(first, X0).inputs, atol=1e-5)
-        assert isinstance(plan, jm.mpc.Plan) and b"jaxmpc.mpc.Plan" in stored
+        assert isinstance(plan, jm.mpc.Plan) and b"jaxmpc.Plan" in stored
 
 
 def test_what_cannot_be_stored_says_so():
