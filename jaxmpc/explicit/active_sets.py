@@ -204,7 +204,7 @@ class LeastDistanceForm:
         span, size, _ = np.linalg.svd(self.M[rows].T, full_matrices=False)
         span = span[:, size > 1e-10 * size.max(initial=0.0)]
         A, b = span.T @ self.M[rows].T, span.T @ total
-        return cleaned(A, 1.0), cleaned(b, np.linalg.norm(total))
+        return cleaned(A, 1.0), cleaned(b, float(np.linalg.norm(total)))
 
     def active(self, xi: np.ndarray) -> tuple[int, ...] | None:
         """Return the active set of the perturbed problem at ξ; None where there is no solution."""

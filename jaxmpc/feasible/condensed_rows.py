@@ -20,6 +20,7 @@ from jaxmpc.mpc.rows import Block
 from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.linalg import matmul
 from jaxmpc.qp.problem import Bounds
+from jaxmpc.qp.solve import INFINITE
 from jaxmpc.sets.convex_sets import set_bounds
 from jaxmpc.sets.lp import FLAT, Optimum, Program, cleaned, power_of_two, scaling
 
@@ -89,6 +90,10 @@ def constraint_rows(
         rest = np.asarray(view.fixed)[others]
         lower, upper = lower - c.D[:, others] @ rest, upper - c.D[:, others] @ rest
         psi = psi + c.Psi[:, :, others] @ rest
+
+    # Solvers of linear programs take limits so large as none too.
+    lower = np.where(lower <= -INFINITE, -np.inf, lower)
+    upper = np.where(upper >= INFINITE, np.inf, upper)
 
     # Inputs and free states in units of their limits, relative to the first input's: the variables
     # count alike.

@@ -214,7 +214,7 @@ def given_blocks(mpc: MPC, dtype: DTypeLike) -> list[Block]:
         D, *sides = limit.rows()
         add("rate", None, D, tuple(sides), range(N), texts, rate=True, box=True)
     for soft in (mpc.soft,) if isinstance(mpc.soft, Soft) else mpc.soft:
-        stages, p = soft_stages(mpc, soft), np.shape(soft.C)[-2:-1]
+        stages, p = soft_stages(mpc, soft), cast(soft.C).shape[-2:-1]
         linear, quadratic = cast(soft.rho), 2 * cast(soft.quadratic)
         linear, quadratic = (
             v if v.ndim == 2 else jnp.broadcast_to(v, p) for v in (linear, quadratic)

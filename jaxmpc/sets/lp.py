@@ -108,10 +108,17 @@ class Program:
         claim = True
         for _ in range(2):
             found, claim = self._model.maximise(cost, method)
-            if found is None or self._excess(found[0], 0.0) <= KEPT:
+            if found is None or self._within(found[0]):
                 return found, claim
             self._model.forget()
         return None, claim
+
+    def _within(self, x: np.ndarray) -> bool:
+        """Return whether x keeps the scaled rows to KEPT, of their terms where these are above 1:
+        bounds of 1e20 that mean none have others."""
+        terms = np.maximum(np.abs(self.M) @ np.abs(x), np.abs(self.b))
+        excess = self.M @ x - self.b
+        return bool(np.all(np.where(self.equal, np.abs(excess), excess) <= KEPT * (1 + terms)))
 
     def _excess(self, x: np.ndarray, least: float) -> float:
         """Return by how much x violates the scaled rows, or `least` where that is more."""

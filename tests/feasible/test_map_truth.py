@@ -130,9 +130,11 @@ def test_volume_and_polytopes(planar):
     )
     assert low <= hull.area
     for a in np.random.default_rng(1).standard_normal((20, 2)):
+        assert hull.support(a) <= polygon.support(a)
+        # Vertices of half-spaces in floats, where facets are nearly parallel.
         exactly = float(polygon.support(a))
-        assert (inner.vertices() @ a).max() <= exactly * (1 + 1e-11) + 1e-11
-        assert (outer.vertices() @ a).max() >= exactly * (1 - 1e-11) - 1e-11
+        assert (inner.vertices() @ a).max() <= exactly * (1 + 1e-10) + 1e-10
+        assert (outer.vertices() @ a).max() >= exactly * (1 - 1e-10) - 1e-10
 
 
 def test_boundary(planar):

@@ -21,7 +21,7 @@ from jaxmpc.feasible.map import FeasibleSetMap
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.recursion.proofs import settle_claims
 
-NONE = (np.inf, 1e9, 1e12, 1e20)
+NONE = (1e20, np.inf, 1e9, 1e12)
 
 
 def slow(*values):

@@ -132,7 +132,7 @@ def test_roll_out_is_that_of_fractions(name):
                 value = exact(H) @ x + (exact(D) @ u[k] if k < 5 else 0)
                 least += [Fraction(b) - value for b in (upper,) if np.isfinite(b)]
                 least += [value - Fraction(b) for b in (lower,) if np.isfinite(b)]
-            x = exact(p.A) @ x + exact(p.B) @ u[k] + exact(p.c) if k < 5 else x
+            x = exact(p.A[k]) @ x + exact(p.B[k]) @ u[k] + exact(p.c[k]) if k < 5 else x
         if p.P is not None:
             least.append(Fraction(p.level) - x @ exact(p.P) @ x)
         assert float(min(least)) == margin
