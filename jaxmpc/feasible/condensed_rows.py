@@ -91,9 +91,10 @@ def constraint_rows(
         lower, upper = lower - c.D[:, others] @ rest, upper - c.D[:, others] @ rest
         psi = psi + c.Psi[:, :, others] @ rest
 
-    # Solvers of linear programs take limits so large as none too.
-    lower = np.where(lower <= -INFINITE, -np.inf, lower)
-    upper = np.where(upper >= INFINITE, np.inf, upper)
+    # Limits of 1e20 are none, as solvers of linear programs have it, of rows of lengths up to 1,000.
+    most = 1e-3 * INFINITE * np.linalg.norm(np.hstack([C, D]), axis=1)
+    lower = np.where((lower <= -most) & (most > 0), -np.inf, lower)
+    upper = np.where((upper >= most) & (most > 0), np.inf, upper)
 
     # Inputs and free states in units of their limits, relative to the first input's: the variables
     # count alike.
