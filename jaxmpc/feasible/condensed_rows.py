@@ -91,7 +91,7 @@ def constraint_rows(
         lower, upper = lower - c.D[:, others] @ rest, upper - c.D[:, others] @ rest
         psi = psi + c.Psi[:, :, others] @ rest
 
-    # Limits of 1e20 are none, as solvers of linear programs have it, of rows of lengths up to 1,000.
+    # Limits of 1e20 are none, as solvers of linear programs have it, of rows up to 1,000 long.
     most = 1e-3 * INFINITE * np.linalg.norm(np.hstack([C, D]), axis=1)
     lower = np.where((lower <= -most) & (most > 0), -np.inf, lower)
     upper = np.where((upper >= most) & (most > 0), np.inf, upper)
