@@ -31,6 +31,7 @@ import tyro
 from bench.families import family, joint
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter, ScalarFormatter
+from user_calls import uniform
 
 import jaxmpc as jm
 from jaxmpc.batches import Compiled, chosen_devices, over_devices, placement, to_host
@@ -77,11 +78,6 @@ class Settings:
 
 # One measured call: () → result.
 Call = Callable[[], Any]
-
-
-def uniform(states: int) -> np.ndarray:
-    """Return states of the joint, some of which are infeasible."""
-    return np.random.default_rng(0).uniform([-1.6, -2.1], [1.6, 2.1], (states, 2))
 
 
 def label_calls(count: int, devices: int) -> dict[str, Call]:

@@ -306,8 +306,8 @@ def first_rows(tree: Any, count: int) -> Any:
 
 def joined(parts: Sequence[Any], out: Any = None) -> Any:
     """Return the host arrays of pytrees one after the other, copied by several threads: a single
-    one is slower than a fast device. out: arrays to write into, in place of new
-    ones; what goes beyond their end is left out."""
+    one is slower than a fast device. out: arrays to write into, in place of new ones; what goes
+    beyond their end is left out."""
     leaves = list(zip(*map(jax.tree.leaves, parts), strict=True))  # the parts of each
     if out is None:
         whole = [np.empty((sum(map(len, vs)), *vs[0].shape[1:]), vs[0].dtype) for vs in leaves]
@@ -356,8 +356,7 @@ def host_copies(trees: list[T]) -> list[T]:
 
 
 def _begin_copy(v: jax.Array) -> jax.Array:
-    device = next(iter(v.sharding.device_set))
-    if v.nbytes >= PINNED and _has_pinned(device):
+    if v.nbytes >= PINNED and _has_pinned(next(iter(v.sharding.device_set))):
         return jax.device_put(v, v.sharding.with_memory_kind("pinned_host"))
     v.copy_to_host_async()
     return v

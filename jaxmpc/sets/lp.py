@@ -117,13 +117,12 @@ class Program:
         """Return whether x keeps the scaled rows to KEPT, of their terms where these are above 1:
         bounds of 1e20 that mean none have others."""
         terms = np.maximum(np.abs(self.M) @ np.abs(x), np.abs(self.b))
-        excess = self.M @ x - self.b
-        return bool(np.all(np.where(self.equal, np.abs(excess), excess) <= KEPT * (1 + terms)))
+        return bool(np.all(self._excess(x) <= KEPT * (1 + terms)))
 
-    def _excess(self, x: np.ndarray, least: float) -> float:
-        """Return by how much x violates the scaled rows, or `least` where that is more."""
+    def _excess(self, x: np.ndarray) -> np.ndarray:
+        """Return by how much x violates each of the scaled rows."""
         excess = self.M @ x - self.b
-        return float(np.where(self.equal, np.abs(excess), excess).max(initial=least))
+        return np.where(self.equal, np.abs(excess), excess)
 
     def change_last_column(self, values: np.ndarray) -> None:
         """Put other values (rows,) in place of the last column of G. The next program begins at the
@@ -185,7 +184,7 @@ class Program:
             if found is not None:
                 x, y, count = found[0][:-1], found[1].copy(), len(self.b)
                 y[:count][self.equal] -= y[count:-1]
-                return x, y[:count], self._excess(x, -1.0)
+                return x, y[:count], float(self._excess(x).max(initial=-1.0))
         fail("LP", "HiGHS finds no point of least violation", "Scale the rows to like size")
 
     @cached_property
