@@ -32,6 +32,8 @@ from jaxmpc.sets.lp import power_of_two
 VOLUME_ROUNDING = 1e-11
 # Points that a GPU takes at once where rays have found polytopes, which need little memory a point.
 HULL = 2**22
+# Why labels under policies take no executor.
+EXECUTOR = "given with affine policies or tubes, whose hull one process keeps"
 # What refinement proves, and its dimensions in data sets.
 BOUNDS = {
     "bound_point": ("ray", "coordinate"),
@@ -232,6 +234,9 @@ class FeasibleSetMap:
         import xarray as xr
 
         further = {"start": ("state",), "plan": ("time", "input"), "cut_normal": ("coordinate",)}
+        further["answer"] = ("time", "input", "cause", "direction")
+        if self.mpc.policy == "tube":
+            further["answer"] = ("generator",)
         data = {
             name: (("sample", *further.get(name, ())), value)
             for name, value in self.labels.arrays().items()
@@ -391,7 +396,7 @@ def _map_policies(
     """Label points (B, d) under affine policies."""
     _require_points(problem, points)
     if settings.get("executor") is not None:
-        fail("executor", "given with affine policies, whose hull one process keeps", "Leave it out")
+        fail("executor", EXECUTOR, "Leave it out")
     chunk = settings.get("chunk")
     chunk = None if chunk is None else whole("chunk", chunk, 1)
     labels = policy_labels(problem, points, chunk, settings.get("devices"))

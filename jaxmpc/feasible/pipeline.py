@@ -158,18 +158,25 @@ class Labels:
 
     @classmethod
     def proved(
-        cls, label: np.ndarray, status: np.ndarray, verdict: Callable[[], Verdict]
+        cls,
+        label: np.ndarray,
+        status: np.ndarray,
+        verdict: Callable[[], Any],
+        more: Mapping[str, int] | None = None,
     ) -> "Labels":
-        """Return labels with the proofs in a verdict on a device, which is asked for when one of
-        them is used."""
+        """Return labels with the proofs in a `Verdict` on a device, which is asked for when one of
+        them is used; NaN, or −1, where they prove nothing. more: fields of it beside those of
+        `PROOFS`, and the label that each proves."""
 
-        def proof(name: str, of: int) -> OnDemand[np.ndarray]:  # NaN where it proves nothing
+        def proof(name: str, of: int) -> OnDemand[np.ndarray]:
             def fetch() -> np.ndarray:
-                return _put(to_host(getattr(verdict(), name)), label != of, np.nan)
+                value = to_host(getattr(verdict(), name))
+                return _put(value, label != of, np.nan if value.dtype.kind == "f" else -1)
 
             return OnDemand(fetch)
 
-        return cls(label, status, {name: proof(name, of) for name, of in PROOFS.items()})
+        named = PROOFS | dict(more or {})
+        return cls(label, status, {name: proof(name, of) for name, of in named.items()})
 
     @classmethod
     def empty(cls, count: int, problem: FeasibilityProblem) -> "Labels":

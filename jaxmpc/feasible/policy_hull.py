@@ -48,7 +48,7 @@ from jaxmpc.feasible.policy_problem import (
     problem_of,
     rounded,
 )
-from jaxmpc.feasible.proofs import Cut, Verdict
+from jaxmpc.feasible.proofs import Cut
 from jaxmpc.feasible.rays import BACKOFFS, Boundary, ProvedBounds, close_gap, leaving
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import record
@@ -56,6 +56,26 @@ from jaxmpc.qp.status import Status
 
 # By label: 0, 1, −1.
 STATUSES = np.array([Status.ITERATION_LIMIT, Status.SOLVED, Status.PRIMAL_INFEASIBLE], np.int8)
+
+
+# What labels under policies have beside the proofs of others, and the label that each proves.
+POLICY_PROOFS = {"cone": 1, "answer": 1}
+
+
+class PolicyVerdict(NamedTuple):
+    """A `proofs.Verdict` on each of b points, whose plans are those of policies.
+
+    cone (b,): the cone of the hull in which the policy is a combination of those at its vertices;
+    −1 where it is one of its own, with answer (b, …) beside the plan (`answer_shape`), else NaN.
+    """
+
+    label: np.ndarray
+    start: np.ndarray
+    plan: np.ndarray
+    cut_normal: np.ndarray
+    cut_offset: np.ndarray
+    cone: np.ndarray
+    answer: np.ndarray
 
 
 @record
@@ -157,12 +177,14 @@ class PolicyRays:
 class PolicyHull:
     """The cones of proved triples, as a `Hull` with policies for its values, and its rays.
 
+    corners (F, d): indices of the triples of each cone beside the centre, among those of `bounds`.
     gap: of the volumes of the hull and of the half-spaces, relative to the latter.
     """
 
     rays: PolicyRays
     hull: Hull
     bounds: ProvedBounds
+    corners: np.ndarray
     gap: float
 
     @classmethod
@@ -197,7 +219,21 @@ class PolicyHull:
         _, _, normals, offsets, cuts = bounds
         least = off, 1 - d * off
         hull = Hull(rays.center, M, gauge, *least, w[-1], slope, normals, offsets, cuts, left)
-        return cls(rays, hull, bounds, left)
+        return cls(rays, hull, bounds, facets, left)
+
+    @property
+    def triples(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the proved states (K + 1, d), their plans (K + 1, N, m) and what else their
+        policies have (K + 1, …); those of the centre last."""
+        theta = np.vstack([self.bounds.points, self.rays.center])
+        return theta, *self.split(np.vstack([self.bounds.w, self.rays.w]))
+
+    def split(self, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return plans (K, N, m) and the rest (K, …) of flattened policies (K, v)."""
+        problem = self.rays.problem
+        N, m = problem.mpc.horizon, problem.mpc.system.m
+        shape = problem.answer_shape
+        return w[:, : N * m].reshape(len(w), N, m), w[:, N * m :].reshape(len(w), *shape)
 
     def policies(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return v (B, N m) and M (B, N m, N g) of feasible points (B, d), for ω as in
@@ -301,10 +337,15 @@ def affine_policies(mpc: MPC | PolicyProblem, x0s: Reals) -> AffinePolicies:
 
 
 def policy_labels(
-    problem: PolicyProblem, points: np.ndarray, chunk: int | None = None, devices: Any = None
+    problem: PolicyProblem,
+    points: np.ndarray,
+    chunk: int | None = None,
+    devices: Any = None,
+    most: int = MOST_PROGRAMS,
 ) -> Labels:
-    """Return the labels of points (B, d), not finite ones too, with their proofs: the plan v of the
-    policy, or a half-space. Raises ValueError as `PolicyHull.of` does."""
+    """Return the labels of points (B, d), not finite ones too, with their proofs: a
+    `PolicyVerdict`. most: points that get a ray of their own. Raises ValueError as `PolicyHull.of`
+    does."""
     found = policy_hull(problem)
     begun, compiled = time.perf_counter(), Compiled.seconds
     chosen = chosen_devices(devices)
@@ -320,8 +361,8 @@ def policy_labels(
             parts.append(tuple(np.asarray(v)[: len(part)] for v in done))
     label, status = (np.concatenate(v) for v in zip(*parts, strict=True))
     verdict = OnDemand(functools.partial(_verdicts, found, points, label, chosen))
-    labels = Labels.proved(label, status, verdict.get)
-    left = labels.undecided[:MOST_PROGRAMS]
+    labels = Labels.proved(label, status, verdict.get, POLICY_PROOFS)
+    left = labels.undecided[:most]
     if len(left):
         labels = _by_rays(found, labels, points, left)
     compile_seconds = Compiled.seconds - compiled
@@ -329,29 +370,31 @@ def policy_labels(
     return replace(labels, compile_seconds=compile_seconds, run_seconds=run_seconds)
 
 
-def _verdicts(found: PolicyHull, x: np.ndarray, label: np.ndarray, devices: Devices) -> Verdict:
-    """Return the verdicts on points (B, d): plans v, and half-spaces; nothing for others."""
+def _verdicts(
+    found: PolicyHull, x: np.ndarray, label: np.ndarray, devices: Devices
+) -> PolicyVerdict:
+    """Return the verdicts on points (B, d) by the hull; nothing for others."""
     x = np.where(np.isfinite(x).all(axis=1)[:, None], x, 0.0)
     with jax.enable_x64(True):
-        plan, _, normal, offset = compiled_proofs(devices).run(found.hull, x)
+        w, _, cone, normal, offset = compiled_proofs(devices).run(found.hull, x)
     problem = found.rays.problem
-    N, m = problem.mpc.horizon, problem.mpc.system.m
-    start = problem.view.states(x)
-    plan = np.asarray(plan)[:, : N * m].reshape(len(x), N, m)
-    parts: Any = label, start, plan, normal, offset
-    return Verdict(*parts)
+    plan, _ = found.split(np.asarray(w))
+    none = np.broadcast_to(np.nan, (len(x), *problem.answer_shape))
+    normal, offset, cone = (np.asarray(v) for v in (normal, offset, cone))
+    return PolicyVerdict(label, problem.view.states(x), plan, normal, offset, cone, none)
 
 
 @functools.cache
 def compiled_proofs(devices: Devices) -> Compiled:
-    """Return the compiled proofs: (hull, points (B, d)) → values, labels, normals and offsets."""
+    """Return the compiled proofs: (hull, points (B, d)) → values, labels, cones, normals and
+    offsets."""
 
-    def one(hull: Hull, theta: Array) -> tuple[Array, Array, Array, Array]:
+    def one(hull: Hull, theta: Array) -> tuple[Array, ...]:
         found, cone, facet = label(hull, theta)
         value = hull.value + jnp.sum(hull.slope[cone] * (theta - hull.center), axis=1)
         normal, offset = hull.normals[facet], hull.offsets[facet]
         beyond = proofs.excludes(normal, offset, jnp.zeros_like(normal), theta)
-        return value, found, normal, jnp.where(beyond, offset, jnp.inf)
+        return value, found, cone, normal, jnp.where(beyond, offset, jnp.inf)
 
     return over_devices(jax.vmap(one, in_axes=(None, 0)), devices, (False, True))
 
@@ -359,20 +402,15 @@ def compiled_proofs(devices: Devices) -> Compiled:
 def _by_rays(found: PolicyHull, labels: Labels, x: np.ndarray, left: np.ndarray) -> Labels:
     """Return the labels where a ray from the centre through each point that is left decides."""
     points, problem = x[left], found.rays.problem
-    inside, plans, ends = found.by_rays(points)
-    a, b, w = ends.cuts
+    inside, policies, ends = found.by_rays(points)
+    a, b, w = (np.asarray(v) for v in ends.cuts)
     with jax.enable_x64(True):
         outside = np.asarray(proofs.excludes(*map(jnp.asarray, (a, b, w, points))))
     label = np.where(inside, 1, np.where(outside, -1, 0)).astype(np.int8)
-    N, m = problem.mpc.horizon, problem.mpc.system.m
-    beyond = np.sum(a * points, axis=1) > ends.offsets
-    parts: Any = (
-        label,
-        problem.view.states(points),
-        plans[:, : N * m].reshape(len(points), N, m),
-        a,
-        np.where(beyond, ends.offsets, np.inf),
-    )
-    verdict = Verdict(*parts)
-    more = Labels.proved(label, STATUSES[label], lambda: verdict)
+    plan, answer = found.split(policies)
+    offset = np.where(np.sum(a * points, axis=1) > ends.offsets, ends.offsets, np.inf)
+    own = np.full(len(points), -1, np.int32)
+    start = problem.view.states(points)
+    verdict = PolicyVerdict(label, start, plan, a, offset, own, answer)
+    more = Labels.proved(label, STATUSES[label], lambda: verdict, POLICY_PROOFS)
     return labels.changed(left, more.label, more.status, more.proofs)

@@ -145,8 +145,16 @@ class PolicyProblem(FeasibilityProblem):
         """Return the linear programs over `lifted`."""
         return PolicyPrograms(self.lifted, self.dimension)
 
+    @cached_property
+    def answer_shape(self) -> tuple[int, ...]:
+        """Return the shape of what a policy has beside its plan v: (N, m, N, g) of the M of ω, (g,)
+        of the ζ of a tube."""
+        N, m = self.mpc.horizon, self.mpc.system.m
+        rows, width = self.causal.shape
+        return (rows - N * m,) if self.mpc.policy == "tube" else (N, m, N, width // N)
+
     def _refuse(self) -> NoReturn:
-        cure = 'Give policy="tightened"; map_feasible_set, boundary and feasible_polytope take it'
+        cure = 'Give policy="tightened"; maps, sweeps, boundary and feasible_polytope take it'
         fail("policy", f"{self.mpc.policy!r} has no proofs by one sequence of inputs", cure)
 
     @property
@@ -155,10 +163,6 @@ class PolicyProblem(FeasibilityProblem):
         self._refuse()
 
     rows = weighted_rows = blocks = widest_blocks = condensed
-
-    def plain(self) -> dict[str, Any]:
-        """Refuse: labels under affine policies are not stored."""
-        self._refuse()
 
     def exact(self, region: np.ndarray, size: np.ndarray | None = None) -> Any:
         """Refuse: proofs are those of `exact_rows`."""
@@ -372,7 +376,7 @@ class PolicyPrograms:
         if not t > 1e-9:
             if given is not None:
                 fail("center", f"{given} is not inside the feasible set", "Give None or another")
-            what = "is empty or flat: no initial state has an affine policy with a margin"
+            what = "is empty or flat: no initial state has a policy of this class with a margin"
             cure = "Relax a limit, shrink the disturbance or enlarge the terminal set"
             fail("mpc", f"its feasible set {what}", cure)
         x = x if given is None else np.append(given, x)

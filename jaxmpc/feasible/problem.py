@@ -15,6 +15,7 @@ from jaxmpc.feasible.hard_constraints import Axes, ExactData, View, make_view
 from jaxmpc.feasible.plan_polytope import PlanPolytope
 from jaxmpc.files import as_json
 from jaxmpc.mpc.condense import Condensed, condensed_in_float64
+from jaxmpc.mpc.policy_rows import tube_section
 from jaxmpc.mpc.problem import MPC, Outputs, as_tuple, differing
 from jaxmpc.mpc.rows import Block
 from jaxmpc.mpc.tightening import feedback_gain, require_tightened, without_disturbance
@@ -139,7 +140,7 @@ class FeasibilityProblem:
         from step to step, as H, D, lower and upper may for their steps; moves: index of the free
         move that each input equals. rows: lower ≤ Hx + Du ≤ upper at steps (None: no bound).
         ellipsoid: P and level of x_N'Px_N ≤ level, or None. disturbance: of a robust problem, whose
-        rows are those before they are tightened, the matrix E, the gain K and the set W. axes: the
+        rows are those before they are tightened, as `described_policy` says. axes: the
         mapped states; others: the index of those that are not, and their value or bounds.
         """
         mpc, view, set_ = self.mpc, self.view, self.mpc.terminal_set
@@ -173,8 +174,9 @@ class FeasibilityProblem:
 
 
 def described_policy(mpc: MPC) -> dict[str, Any]:
-    """Return the disturbances and the policy of a robust problem, as `plain` has them: E (n, p),
-    gain (m, n), and W as center and generators, or as points."""
+    """Return the disturbances and the policy of a robust problem, as `plain` has them: E (n, p), W
+    as lower and upper, as center and generators, or as points, and the gain (m, n), which affine
+    policies do not have; of a tube its section too, as center and generators."""
     W: Any = mpc.disturbance
     if isinstance(W, Box):
         lower, upper = np.asarray(W.lower, float), np.asarray(W.upper, float)
@@ -184,8 +186,13 @@ def described_policy(mpc: MPC) -> dict[str, Any]:
     else:
         set_ = {"points": np.asarray(with_vertices(W).points, float)}
     E = disturbance_columns(mpc.disturbance_matrix, mpc.system.n)
-    gain = np.asarray(feedback_gain(mpc), np.float64)
-    return {"policy": mpc.policy, "E": E, "gain": gain, "set": set_}
+    found = {"policy": mpc.policy, "E": E, "set": set_}
+    if mpc.policy != "affine":
+        found["gain"] = np.asarray(feedback_gain(mpc), np.float64)
+    if mpc.policy == "tube":
+        section = tube_section(mpc)
+        found["section"] = {"center": section.center, "generators": section.generators}
+    return found
 
 
 def with_previous_inputs(mpc: MPC, c: Condensed) -> Condensed:

@@ -4,11 +4,16 @@ A grid has one dimension an axis, with its coordinates. Of each sample the store
 status, start (state), plan (time, input), cut_normal (coordinate) and cut_offset: see `Labels`; and
 after refinement bound_point (ray, coordinate), bound_normal (facet, coordinate) and bound_offset
 (facet): see `FeasibleSetMap`.
+
+Under affine policies and tubes a sample has cone and answer too (`policy_hull.PolicyVerdict`). The
+policy of a sample in a cone is the convex combination, by its place, of proved ones: policy_state
+(policy, coordinate), policy_plan (policy, time, input) and policy_answer (policy, …), that of the
+centre last, and those of the cone by corner (cones, vertex).
 """
 
 import re
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -21,8 +26,17 @@ from jaxmpc.arrays import Reals
 from jaxmpc.batches import CHUNK, Part, Timing, default_chunk, work_off
 from jaxmpc.checks import fail
 from jaxmpc.feasible.hard_constraints import Axes
-from jaxmpc.feasible.map import BOUNDS, FeasibleSetMap, excluded
-from jaxmpc.feasible.pipeline import PROOFS, Labels, OnDemand, Scope, labelled_parts
+from jaxmpc.feasible.map import BOUNDS, EXECUTOR, FeasibleSetMap, excluded
+from jaxmpc.feasible.pipeline import (
+    MOST_PROGRAMS,
+    PROOFS,
+    Labels,
+    OnDemand,
+    Scope,
+    labelled_parts,
+)
+from jaxmpc.feasible.policy_hull import POLICY_PROOFS, policy_hull, policy_labels
+from jaxmpc.feasible.policy_problem import PolicyProblem, problem_of
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.rays import Rays
 from jaxmpc.files import check_results
@@ -46,6 +60,8 @@ from jaxmpc.store import (
 LINES = 1024
 # Dimensions and files of a store that no mapped state may be called.
 TAKEN = {"checksum", "block", "state", "input", "time", "coordinate", "sample", "zarr.json"}
+TAKEN |= {"cause", "cones", "corner", "direction", "generator", "policy", "vertex"}
+TAKEN |= {"policy_state", "policy_plan", "policy_answer"}
 # Bytes of the name of a dimension, at most; file systems have 255 for a name.
 MOST_NAME = 100
 # Points proved feasible, or half-spaces, from which on they are reduced to those that matter to the
@@ -137,7 +153,7 @@ class StoredMap:
         none = np.zeros((0, self.problem.dimension))
         alone = FeasibleSetMap.of(self.problem, none, Labels.empty(0, self.problem)).refine(gap)
         normals, offsets = alone.bound_normal, alone.bound_offset
-        if self.undecided and len(offsets):
+        if self.undecided and len(offsets) and not isinstance(self.problem, PolicyProblem):
             exact = Rays.of(self.problem).exact
             for block in self.undecided:
                 before = self._labels(block)
@@ -195,7 +211,7 @@ def step(line: np.ndarray) -> int:
 
 def sweep_into(
     path: str | Path,
-    mpc: MPC,
+    mpc: MPC | FeasibilityProblem,
     along: Sequence[np.ndarray],
     *,
     axes: Axes = None,
@@ -242,7 +258,9 @@ def sweep_into(
     elif overwrite:
         what = "given beside shard (--overwrite, --shard)"
         fail("overwrite", what, "Delete the store before shards start")
-    problem = FeasibilityProblem.of(mpc, axes, fixed)
+    problem = mpc if isinstance(mpc, FeasibilityProblem) else sweep_problem(mpc, axes, fixed)
+    if executor is not None and isinstance(problem, PolicyProblem):
+        fail("executor", EXECUTOR, "Leave it out")
     settings = {"iterations": iterations, "dtype": dtype} if settings is None else settings
     how: dict[str, Any] = {"shard": shard, "overwrite": overwrite, "begun": begun}
     with open_labels(path, problem, along, settings, chunk, **how) as store:
@@ -255,17 +273,14 @@ def sweep_into(
         opened(store)
         parts = [store.parts(block, default_chunk()) for block in range(len(store.regions))]
         places = [(block, part) for block in pending for part in parts[block]]
-        found = labelled_parts(
-            problem,
-            places,
-            lambda place: mesh(along, np.r_[place[1]]),
-            Scope.of_grid(along, sum(map(len, parts))),
-            store.part_size(default_chunk()),
-            executor=executor,
-            iterations=iterations,
-            dtype=dtype,
-            devices=devices,
-        )
+        count, size = sum(map(len, parts)), store.part_size(default_chunk())
+        points = lambda place: mesh(along, np.r_[place[1]])
+        if isinstance(problem, PolicyProblem):
+            found = _parts_of_policies(problem, places, points, count, size, devices)
+        else:
+            scope = Scope.of_grid(along, count)
+            how = {"iterations": iterations, "dtype": dtype, "devices": devices}
+            found = labelled_parts(problem, places, points, scope, size, executor=executor, **how)
         total = sum(part.stop - part.start for _, part in places)
         show = None if progress else False
         with BlockWriter(store) as writer:
@@ -287,6 +302,33 @@ def sweep_into(
         return whole
 
 
+def sweep_problem(mpc: MPC, axes: Axes = None, fixed: Reals | None = None) -> FeasibilityProblem:
+    """Return the feasibility problem of `mpc`, with all found that its labels rest on. Raises
+    ValueError for what `sweep_into` cannot label; nothing is written."""
+    problem = problem_of(mpc, axes, fixed)
+    if isinstance(problem, PolicyProblem):
+        policy_hull(problem)
+    else:
+        problem.blocks  # noqa: B018 - is computed once, or refused
+    return problem
+
+
+def _parts_of_policies(
+    problem: PolicyProblem,
+    places: Sequence[Any],
+    points: Callable[[Any], np.ndarray],
+    count: int,
+    size: int,
+    devices: Any,
+) -> Iterator[Part[Labels]]:
+    """Label the points at each of the places, of which there are `count` in the whole grid, and
+    yield the parts in order."""
+    for place in places:
+        most = -(-MOST_PROGRAMS // count)
+        labels = policy_labels(problem, points(place), size, devices, most)
+        yield Part(place, len(labels.label), labels, labels.compile_seconds)
+
+
 def open_labels(
     path: str | Path,
     problem: FeasibilityProblem,
@@ -302,6 +344,10 @@ def open_labels(
     """
     mpc, system = problem.mpc, problem.mpc.system
     all_fields = label_fields(mpc.dimension, mpc.horizon, system.m, problem.dimension)
+    constants: dict[str, Constant] = {}
+    if isinstance(problem, PolicyProblem):
+        more, constants = policy_format(problem)
+        all_fields |= more
     all_fields |= dict(fields or {})
     names = [_name_and_unit(name) for name in problem.axis_names]
     dimensions = dimension_names([name for name, _ in names], all_fields)
@@ -310,7 +356,7 @@ def open_labels(
         for dimension, values, (name, unit) in zip(dimensions, along, names, strict=True)
     }
     texts = {"coordinate": problem.axis_names, "state": mpc.labels, "input": system.input_labels}
-    constants = {
+    constants |= {
         name: Constant(np.array(list(values), str), (name,)) for name, values in texts.items()
     }
     about_time = {"long_name": "time of the input", "units": "s" if system.dt else "1"}
@@ -354,9 +400,34 @@ def label_fields(n: int, horizon: int, m: int, d: int) -> dict[str, Field]:
     }
 
 
+def policy_format(problem: PolicyProblem) -> tuple[dict[str, Field], dict[str, Constant]]:
+    """Return the further variables of labels under policies, of each state and of all together."""
+    hull, shape = policy_hull(problem), problem.answer_shape
+    theta, plan, answer = hull.triples
+    axes = ("generator",) if len(shape) == 1 else ("time", "input", "cause", "direction")
+    rest = "the offset of a tube" if len(shape) == 1 else "the feedback of a policy"
+    about = {"long_name": "cone in which the policy is a combination; -1: it is one of its own"}
+    own = {"long_name": f"{rest} that is no combination"}
+    fields = {
+        "cone": Field((), "int32", -1, (), about),
+        "answer": Field(shape, "float64", np.nan, axes, own),
+    }
+    proved = {"long_name": "state with a proved policy, the centre last"}
+    constants = {
+        "policy_state": Constant(theta, ("policy", "coordinate"), proved),
+        "policy_plan": Constant(plan, ("policy", "time", "input"), {"long_name": "its plan"}),
+        "policy_answer": Constant(answer, ("policy", *axes), {"long_name": rest}),
+        "corner": Constant(
+            hull.corners.astype(np.int32), ("cones", "vertex"), {"long_name": "policies of a cone"}
+        ),
+    }
+    return fields, constants
+
+
 def stored_labels(store: Store) -> Labels:
     """Return the labels in a store; proofs are read when they are used."""
-    proofs = {name: OnDemand(partial(store.read, name)) for name in PROOFS}
+    names = [name for name in (*PROOFS, *POLICY_PROOFS) if name in store.fields]
+    proofs = {name: OnDemand(partial(store.read, name)) for name in names}
     return Labels(store.read("label"), store.read("status"), proofs)
 
 

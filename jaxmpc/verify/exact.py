@@ -63,7 +63,7 @@ def roll_out_exactly(p: Constraints, starts: np.ndarray, plans: np.ndarray) -> n
         change = integers(X, e)
         missed = _at(p, e, rows, x, u, one, p.upper)
         G = -_at(p, e, rows, np.zeros((len(X), p.sizes[0]), object), change, 0, None).T
-        inverse = _inverse(G)
+        inverse = inverse_of(G)
         if inverse is not None:
             K, one = inverse  # the inverse of G is K / one
             moved = np.tensordot(missed @ K.T, change, axes=1)
@@ -132,7 +132,7 @@ def _at(
     return np.stack(found, axis=1)
 
 
-def _inverse(G: np.ndarray) -> tuple[np.ndarray, int] | None:
+def inverse_of(G: np.ndarray) -> tuple[np.ndarray, int] | None:
     """Return integers K (q, q) and d with G K = d I; None for a singular matrix G of integers."""
     q = len(G)
     rows = [
@@ -179,20 +179,26 @@ def roll_out_in_floats(p: Constraints, starts: np.ndarray, plans: np.ndarray) ->
 
 
 def beyond(
-    p: Constraints, y: list[np.ndarray], points: np.ndarray, box: tuple[np.ndarray, ...]
+    p: Constraints,
+    y: list[np.ndarray],
+    points: np.ndarray,
+    box: tuple[np.ndarray, ...],
+    more: Fraction = Fraction(0),
 ) -> np.ndarray:
     """Return by how much points (b, d) violate the half-space that multipliers imply, relative to
     the largest entry of its normal; −∞ where it implies none. Computed without rounding.
 
     y: of the rows of each step, y > 0 on the upper bound and y < 0 on the lower; then, of a
     terminal ellipsoid, the vector v of v'Px ≤ √(level·v'Pv). box: lower and upper bounds (moves, m)
-    of the inputs and of the states that are not mapped, ±∞ where there are none.
+    of the inputs and of the states that are not mapped, ±∞ where there are none. more: what the
+    right-hand side of the half-space has beside the terms at the top of this file.
     """
     n, (low, high, others_low, others_high) = p.sizes[0], box
     e = p.exponent(points, *box, *y)
     motion = _motion(p, e)
     # Sums are over 2^top. The costate p_k is over 2^((N−k+2)e): each step multiplies by A.
-    top, total = (p.N + 4) * e, 0
+    top = (p.N + 4) * e
+    total = math.ceil(more * (1 << top))
     lowers, uppers = p.widest
     costate, slopes = np.zeros(n, object), np.zeros(low.shape, object)
     for k in range(p.N, -1, -1):
@@ -229,9 +235,9 @@ def beyond(
     if not largest:  # 0'θ ≤ b excludes every θ if b < 0
         return np.full(len(points), np.inf if total < 0 else -np.inf)
     left = integers(points, e) @ normal - total
-    return np.array([_ratio(int(v), largest << e) for v in left])
+    return np.array([ratio(int(v), largest << e) for v in left])
 
 
-def _ratio(over: int, under: int) -> float:
+def ratio(over: int, under: int) -> float:
     """Return over / under, not rounded to zero."""
     return over / under or math.copysign(5e-324, over) * (over != 0)

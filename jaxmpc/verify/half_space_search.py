@@ -14,6 +14,7 @@ from scipy.optimize import linprog
 from tqdm.std import tqdm
 
 from jaxmpc.verify.exact import beyond
+from jaxmpc.verify.exact_policies import AffineRows, Multipliers
 from jaxmpc.verify.stored_problem import Constraints
 
 # Tangents to a terminal ellipsoid that a linear program gets at most.
@@ -22,19 +23,24 @@ TOLERANCES = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance
 
 
 def exclude(
-    p: Constraints, points: np.ndarray, normals: np.ndarray, bar: tqdm | None = None
+    p: Constraints,
+    points: np.ndarray,
+    normals: np.ndarray,
+    bar: tqdm | None = None,
+    affine: AffineRows | None = None,
 ) -> np.ndarray:
     """Return by how much points (b, d) lie beyond half-spaces that no feasible state leaves, found
-    anew in the directions normals (b, d) or else by least violation; see `exact.beyond`."""
+    anew in the directions normals (b, d) or else by least violation; see `exact.beyond`. affine:
+    what affine policies do about disturbances, None without."""
     best, left = np.full(len(points), -np.inf), np.ones(len(points), bool)
     if not len(points):
         return best
-    programs = Programs(p)
+    programs = Programs(p) if affine is None else AffinePrograms(p, affine)
     box = programs.boxes()
     while left.any():
         first = int(np.flatnonzero(left)[0])
         for y in programs.multipliers(points[first], normals[first]):
-            best[left] = np.maximum(best[left], beyond(p, y, points[left], box))
+            best[left] = np.maximum(best[left], programs.beyond(y, points[left], box))
             if best[first] > 0:
                 break
         done = left & (best > 0)
@@ -71,6 +77,8 @@ class Programs:
                 self.place += [(k, int(i), sign) for i in there]
         self.motion, self.drift = motion.tocsr(), np.concatenate(p.c)
         self.rows, self.bounds = sp.vstack(parts).tocsr(), np.concatenate(bounds)
+        # How much each row may be violated, in units of the least violation that is looked for.
+        self.elastic = np.ones(len(self.bounds))
         self.tangents: list[np.ndarray] = []
         if p.P is not None:  # its box
             there = np.flatnonzero(np.diag(p.P))
@@ -101,7 +109,8 @@ class Programs:
                 rows, bounds = sp.vstack([rows, extra]), np.append(bounds, values)
             motion = self.motion
             if elastic:
-                rows = sp.hstack([rows, -np.ones((rows.shape[0], 1))])
+                grown = np.append(self.elastic, np.ones(rows.shape[0] - len(self.elastic)))
+                rows = sp.hstack([rows, -grown[:, None]])
                 motion = sp.hstack([motion, np.zeros((motion.shape[0], 1))])
             equations = {"A_eq": motion, "b_eq": self.drift, "bounds": variables}
             how = {"method": "highs-ds", "options": TOLERANCES}
@@ -114,7 +123,7 @@ class Programs:
             self.tangents.append(last)
         return found
 
-    def multipliers(self, theta: np.ndarray, normal: np.ndarray) -> Iterator[list[np.ndarray]]:
+    def multipliers(self, theta: np.ndarray, normal: np.ndarray) -> Iterator[Any]:
         """Yield multipliers of the rows: of the largest normal'θ, then of the least violation from
         theta."""
         p = self.p
@@ -128,13 +137,22 @@ class Programs:
                 continue
             values = -found.ineqlin.marginals
             values[np.abs(values) < 1e-13 * np.abs(values).max(initial=0.0)] = 0.0
-            y = [np.zeros(len(rows)) for rows in p.lower]
-            for (k, i, sign), value in zip(self.place, values, strict=False):
-                y[k][i] += sign * value
-            if p.P is not None:
-                weights = values[len(self.place) :]
-                y.append(weights @ np.array(self.tangents[: len(weights)]))
-            yield y
+            yield self.of_rows(values)
+
+    def of_rows(self, values: np.ndarray) -> Any:
+        """Return multipliers of the rows of each step, for `beyond`, from those of the program."""
+        p = self.p
+        y = [np.zeros(len(rows)) for rows in p.lower]
+        for (k, i, sign), value in zip(self.place, values, strict=False):
+            y[k][i] += sign * value
+        if p.P is not None:
+            weights = values[len(self.place) :]
+            y.append(weights @ np.array(self.tangents[: len(weights)]))
+        return y
+
+    def beyond(self, y: Any, points: np.ndarray, box: tuple[np.ndarray, ...]) -> np.ndarray:
+        """Return `exact.beyond` of the half-space that these multipliers imply."""
+        return beyond(self.p, y, points, box)
 
     def boxes(self) -> tuple[np.ndarray, ...]:
         """Return lower and upper bounds (moves, m) of the inputs and of the states that are not
@@ -158,3 +176,101 @@ class Programs:
                 room = 1e-6 * np.max(np.abs(ends), initial=0.0, where=np.isfinite(ends))
                 lower[j], upper[j] = max(lower[j], ends[0] - room), min(upper[j], ends[1] + room)
         return found[0].reshape(size), found[1].reshape(size), found[2], found[3]
+
+
+class AffinePrograms(Programs):
+    """The same over trajectories and affine policies: with X_k (n, k g) and M_k (m, k g), what x_k
+    and u_k owe to the ω of the steps before k, and T_k ≥ |H_k X_k + D_k M_k|."""
+
+    def __init__(self, p: Constraints, affine: AffineRows) -> None:
+        """Assemble the equations of motion and the rows."""
+        super().__init__(p)
+        self.affine, (n, m), g = affine, p.sizes, affine.push.shape[1]
+        push, middle = (np.asarray(v, float) for v in (affine.push, affine.middle))
+        self.drift = self.drift + np.tile(middle, p.N)
+        # Columns of X_k, M_k and T_k begin at these places, matrices column by column.
+        place, size = np.zeros((3, p.N + 1), int), self.count
+        for k in range(1, p.N + 1):
+            for j, rows in enumerate((n, m if k < p.N else 0, len(p.H[k]))):
+                place[j, k], size = size, size + k * g * rows
+        x, u, t = place
+        motion, rows = _Entries(), _Entries()
+        drift, height = list[np.ndarray](), 0
+        for k in range(p.N):
+            if k:
+                one = sp.identity(k * g)
+                motion.put(height, x[k + 1], sp.identity(n * k * g))
+                motion.put(height, x[k], -sp.kron(one, p.A[k]))
+                motion.put(height, u[k], -sp.kron(one, p.B[k]))
+            motion.put(height + n * k * g, x[k + 1] + n * k * g, sp.identity(n * g))
+            drift += [np.zeros(n * k * g), push.T.ravel()]
+            height += n * (k + 1) * g
+        self.t_rows, low = [(0, 0)], 0
+        for k in range(1, p.N + 1):
+            one, count = sp.identity(k * g), k * g * len(p.H[k])
+            for sign in (1.0, -1.0):
+                rows.put(low, x[k], sign * sp.kron(one, p.H[k]))
+                if k < p.N:
+                    rows.put(low, u[k], sign * sp.kron(one, p.D[k]))
+                rows.put(low, t[k], -sp.identity(count))
+                self.t_rows.append((low, low + count))
+                low += count
+        ends = _Entries()
+        for r, (k, i, _) in enumerate(self.place):
+            for column in range(k * g):
+                ends.put(r, t[k] + column * len(p.H[k]) + i, np.ones((1, 1)))
+        count = len(self.bounds)
+        self.rows.resize(count, size)
+        self.motion.resize(self.motion.shape[0], size)
+        own = self.rows + ends.matrix(count, size)
+        self.rows = sp.vstack([own, rows.matrix(low, size)]).tocsr()
+        self.motion = sp.vstack([self.motion, motion.matrix(height, size)]).tocsr()
+        self.drift = np.concatenate([self.drift, *drift])
+        self.bounds = np.append(self.bounds, np.zeros(low))
+        self.elastic, self.count = np.append(self.elastic, np.zeros(low)), size
+
+    def of_rows(self, values: np.ndarray) -> Multipliers:
+        """Return multipliers of both sides of the rows, and of what they owe to disturbances."""
+        p, g = self.p, self.affine.push.shape[1]
+        above, below = ([np.zeros(len(H)) for H in p.H] for _ in range(2))
+        for (k, i, sign), value in zip(self.place, values, strict=False):
+            (above if sign > 0 else below)[k][i] = max(value, 0.0)
+        parts, Q = np.maximum(values[len(self.place) :], 0.0), [np.zeros((len(p.H[0]), 0))]
+        for k in range(1, p.N + 1):
+            plus, minus = (parts[slice(*self.t_rows[2 * k - 1 + i])] for i in range(2))
+            Q.append((plus - minus).reshape(k * g, len(p.H[k])).T)
+        return Multipliers(above, below, Q)
+
+    def beyond(self, y: Any, points: np.ndarray, box: tuple[np.ndarray, ...]) -> np.ndarray:
+        """Return `exact.beyond` of the half-space that these multipliers imply."""
+        more = self.affine.more(y, *box[:2])
+        if more is None:
+            return np.full(len(points), -np.inf)
+        return beyond(self.p, y.difference, points, box, more)
+
+    def boxes(self) -> tuple[np.ndarray, ...]:
+        """Return lower and upper bounds (N, m) of the inputs and of the states that are not mapped:
+        the limits on each alone, ±∞ where there are none."""
+        size = self.p.N, self.p.sizes[1]
+        low, high = np.full(size, -np.inf), np.full(size, np.inf)
+        for move, i, least, most in self.p.input_rows():
+            low[move, i], high[move, i] = max(low[move, i], least), min(high[move, i], most)
+        return low, high, self.p.low, self.p.high
+
+
+class _Entries:
+    """Entries of a sparse matrix, put there block by block."""
+
+    def __init__(self) -> None:
+        self.parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+
+    def put(self, row: int, column: int, block: Any) -> None:
+        """Put a block with its first entry at this row and column."""
+        found = sp.coo_matrix(block)
+        self.parts.append((row + found.row, column + found.col, found.data))
+
+    def matrix(self, height: int, width: int) -> Any:
+        """Return the matrix."""
+        none = np.zeros(0, int), np.zeros(0, int), np.zeros(0)
+        row, column, data = (np.concatenate(v) for v in zip(none, *self.parts, strict=True))
+        return sp.coo_matrix((data, (row, column)), (height, width)).tocsr()

@@ -19,12 +19,15 @@ from jaxmpc.pytrees import short_text
 from jaxmpc.qp.status import Status
 from jaxmpc.store import Check, Stored, read, reason
 from jaxmpc.verify.exact import roll_out_exactly, roll_out_in_floats
+from jaxmpc.verify.exact_policies import AffineRows, StoredPolicies
 from jaxmpc.verify.half_space_search import exclude
-from jaxmpc.verify.stored_problem import Constraints, label_shapes
+from jaxmpc.verify.stored_problem import Constraints, by_policies, label_shapes
 
-# What stays of a store when it has been read; what its labels are proved by; names of labels.
+# What stays of a store when it has been read; what its labels are proved by, those about affine
+# policies and tubes too; names of labels.
 KEPT = "label", "status"
 NEEDED = "start", "plan", "cut_normal", "cut_offset"
+OF_POLICIES = "cone", "answer", "corner", "policy_state", "policy_plan", "policy_answer"
 NAMES = {1: "feasible", -1: "infeasible", 0: "undecided"}
 
 
@@ -128,7 +131,9 @@ def _count(found: Stored, result: Verification) -> bool:
         left = found.blocks - found.done
         result.problems.append(f"{left} of {found.blocks} blocks are not done: resume the sweep")
     fields = {*found.attributes.get("variables", {}).get("fields", ()), *found.arrays}
-    missing = [name for name in (*KEPT, *NEEDED) if name not in fields]
+    problem = found.attributes.get("problem", {})
+    needed = (*KEPT, *NEEDED, *OF_POLICIES) if by_policies(problem) else (*KEPT, *NEEDED)
+    missing = [name for name in needed if name not in fields]
     if label is None or missing or not found.axes or "problem" not in found.attributes:
         result.problems.append(f"cannot be verified without {missing or 'its problem'}")
         return False
@@ -153,6 +158,16 @@ class _BlockProofs:
     exactly: int = 0
     margin: float = np.inf
 
+    def count(self, index: np.ndarray, margin: np.ndarray, exactly: np.ndarray, why: str) -> None:
+        """Count the feasible states of these indices that are proved, `exactly` or in floats, with
+        their margins; why: the reason, with a place for its size, where that is negative."""
+        for j in np.flatnonzero(margin < 0):
+            self.failures.setdefault(int(index[j]), why.format(-margin[j]))
+        good = [j for j, i in enumerate(index) if int(i) not in self.failures]
+        self.verified += len(good)
+        self.exactly += int(np.sum(exactly[good]))
+        self.margin = min(self.margin, float(margin[good].min(initial=np.inf)))
+
 
 class _Proofs:
     """Proofs of all labels of a store: of feasible ones block by block, of infeasible ones, for
@@ -163,6 +178,7 @@ class _Proofs:
         self._blocks: dict[int, _BlockProofs | Exception] = {}
         self._lock = Lock()
         self._problem: Constraints | None = None
+        self._policies: StoredPolicies | None = None
         self._feasible = 0
 
     def visit(self, found: Stored, first: int, arrays: Mapping[str, np.ndarray]) -> None:
@@ -190,7 +206,8 @@ class _Proofs:
         infeasible = np.concatenate([block.infeasible for block in blocks])
         normals = np.concatenate([block.normals for block in blocks])
         offsets = np.concatenate([block.offsets for block in blocks])
-        _prove_infeasible(p, found, infeasible, normals, result, self.bar)
+        affine = None if self._policies is None else self._policies.affine
+        _prove_infeasible(p, found, infeasible, normals, result, self.bar, affine)
         _compare_half_spaces(found, infeasible, normals, offsets, result)
         result.failures = {
             i: f"at {found.points_at(np.array([i]))[0].tolist()}: {why}"
@@ -201,7 +218,10 @@ class _Proofs:
         """Return the constraints; count the labels the first time."""
         with self._lock:
             if self._problem is None:
-                self._problem = Constraints(found.attributes["problem"])
+                plain = found.attributes["problem"]
+                self._problem = Constraints(plain)
+                if by_policies(plain):
+                    self._policies = StoredPolicies(plain, self._problem, found.arrays)
                 self._feasible = int(np.sum(found.arrays["label"] == 1))
                 self.bar.total = int(np.count_nonzero(found.arrays["label"]))
             return self._problem
@@ -224,7 +244,11 @@ class _Proofs:
             drawn = self.exact | (draw * self._feasible < self.sample)
             index = first + here
             proofs = found.points_at(index), arrays["start"][here], arrays["plan"][here]
-            _prove_feasible(p, index, *proofs, drawn, block)
+            if self._policies is None:
+                _prove_feasible(p, index, *proofs, drawn, block)
+            else:
+                own = arrays["cone"][here], arrays["answer"][here]
+                _prove_by_policies(self._policies, index, *proofs, *own, drawn, block)
             with self._lock:
                 self.bar.update(len(here))
         return block
@@ -258,12 +282,40 @@ def _prove_feasible(
     margin[known] = roll_out_in_floats(p, starts[known], plans[known])
     again = known & (drawn | ~(margin > 0))
     margin[again] = roll_out_exactly(p, starts[again], plans[again])
-    for j in np.flatnonzero(again & (margin < 0)):
-        block.failures[int(index[j])] = f"its plan breaks a limit by {-margin[j]:.3g}"
-    good = [j for j, i in enumerate(index) if int(i) not in block.failures]
-    block.verified += len(good)
-    block.exactly += int(np.sum(again[good]))
-    block.margin = min(block.margin, float(margin[good].min(initial=np.inf)))
+    block.count(index, margin, again, "its plan breaks a limit by {:.3g}")
+
+
+def _prove_by_policies(
+    policies: StoredPolicies,
+    index: np.ndarray,
+    points: np.ndarray,
+    starts: np.ndarray,
+    plans: np.ndarray,
+    cones: np.ndarray,
+    answers: np.ndarray,
+    drawn: np.ndarray,
+    block: _BlockProofs,
+) -> None:
+    """Prove states of these indices feasible: by their place in the cone of proved policies, those
+    that are drawn in rational arithmetic, or by a policy of their own."""
+    there, combined = (cones >= -1) & (cones < len(policies.corner)), cones >= 0
+    combined &= there
+    at_point = (starts == np.array([policies.start(x) for x in points])).all(axis=1)
+    margin, exactly, same = np.full(len(index), -np.inf), ~combined, np.ones(len(index), bool)
+    margin[combined], exactly[combined], same[combined] = policies.combine(
+        points[combined], cones[combined], plans[combined], drawn[combined]
+    )
+    for j in np.flatnonzero(there & ~combined):
+        margin[j] = policies.margin(points[j], plans[j], answers[j])
+    reasons = {
+        "its cone is not stored": there,
+        "the start of its plan is another state": at_point,
+        "its plan is not that of the policies of its cone": same,
+        "it has no policy, or is in another cone": np.isfinite(margin) | ~there,
+    }
+    for why, fine in reasons.items():
+        block.failures |= {int(i): why for i in index[~fine]}
+    block.count(index, margin, exactly, "its policy breaks a limit by {:.3g}")
 
 
 def _prove_infeasible(
@@ -273,11 +325,12 @@ def _prove_infeasible(
     normals: np.ndarray,
     result: Verification,
     bar: tqdm,
+    affine: AffineRows | None,
 ) -> None:
-    """Prove that no trajectory starts at states labelled infeasible."""
+    """Prove that no trajectory, or no affine policy, starts at states labelled infeasible."""
     open_ = np.array([int(i) not in result.failures for i in infeasible], bool)
     where = infeasible[open_]
-    excess = exclude(p, found.points_at(where), normals[open_], bar)
+    excess = exclude(p, found.points_at(where), normals[open_], bar, affine)
     result.failures |= {
         int(i): "no half-space is found that excludes it" for i in where[~(excess > 0)]
     }

@@ -1,13 +1,18 @@
 """The policy of a stored robust problem, and the rows that it leaves, in rational arithmetic.
 
-The plant is x⁺ = A x + B u + c + E w, w ∈ W, the policy u_k = v_k + K e_k with e_0 = 0 and
-e_{k+1} = (A + BK) e_k + E w_k. A row a'x_k + d'u_{k−1} + b'u_k moves by t_i'E w_{k−1−i} for each
-earlier disturbance, with t_0 = a + K'b, t_1 = (A + BK)'t_0 + K'd and t_{i+1} = (A + BK)'t_i; the
-largest sum of these is what its bounds lose. Floats are rational numbers: no rounding, until each
+The plant is x⁺ = A x + B u + c + E w, w ∈ W. Floats are rational numbers: no rounding, until each
 bound is rounded once, inwards for plans and outwards for half-spaces.
+
+*Tightened*: u_k = v_k + K e_k with e_0 = 0 and e_{k+1} = (A + BK) e_k + E w_k. A row
+a'x_k + d'u_{k−1} + b'u_k moves by t_i'E w_{k−1−i} for each earlier disturbance, with t_0 = a + K'b,
+t_1 = (A + BK)'t_0 + K'd and t_{i+1} = (A + BK)'t_i; the largest sum of these is what its bounds
+lose.
+
+*Tubes*: u_k = v_k + K (x_k − z_k), x_0 − z_0 in a section S = center + {G ζ : |ζ_i| ≤ 1}. The rows
+of z and v lose max {(a + K'b)'s : s ∈ S} at every step.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from fractions import Fraction
 from typing import Any
 
@@ -21,14 +26,40 @@ def fits(described: Any, n: int, m: int) -> bool:
     """Return whether a stored policy fits a problem of n coordinates (x, and u_{−1} where rates are
     limited) and m inputs."""
     rows, p = np.shape(described["E"])
-    set_, right = described["set"], rows in (n, n - m) and p > 0
-    right = right and np.shape(described["gain"]) == (m, rows)
-    if "points" in set_:
-        return right and np.ndim(set_["points"]) == 2 and np.shape(set_["points"])[1] == p
+    right = rows in (n, n - m) and p > 0 and _is_set(described["set"], p)
+    if described["policy"] == "tube":
+        section = described["section"]
+        right = right and "generators" in section and _is_set(section, n)
+    affine = described["policy"] == "affine"
+    return right and (affine or np.shape(described["gain"]) == (m, rows))
+
+
+def _is_set(described: Any, p: int) -> bool:
+    """Return whether this describes a set in R^p."""
+    if "points" in described:
+        return np.ndim(described["points"]) == 2 and np.shape(described["points"])[1] == p
+    if "generators" in described:
+        rows, _ = np.shape(described["generators"])
+        return rows == p and np.shape(described["center"]) == (p,)
+    return np.shape(described["lower"]) == np.shape(described["upper"]) == (p,)
+
+
+def answer_shape(described: Mapping[str, Any], N: int, m: int) -> tuple[int, ...]:
+    """Return the shape of what a policy has beside its plan: M (N, m, N, g) of an affine one, ζ
+    (g,) of a tube."""
+    if described["policy"] == "tube":
+        return np.shape(described["section"]["generators"])[1:]
+    return N, m, N, directions(described["set"])[1].shape[1]
+
+
+def directions(set_: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    """Return center (p,) and Γ (p, g), in Fractions, of w = center + Γ ω with |ω_i| ≤ 1; a box has
+    a direction for each coordinate in which it is not flat."""
     if "generators" in set_:
-        same = np.shape(set_["center"]) == (p,)
-        return right and same and np.shape(set_["generators"])[0] == p
-    return right and np.shape(set_["lower"]) == np.shape(set_["upper"]) == (p,)
+        return fractions(set_["center"]), fractions(set_["generators"])
+    lower, upper = fractions(set_["lower"]), fractions(set_["upper"])
+    half = (upper - lower) / 2
+    return (lower + upper) / 2, np.diag(half)[:, half > 0] + Fraction(0)
 
 
 def fractions(values: Any) -> np.ndarray:
@@ -63,15 +94,49 @@ def tightened(
     n = len(E)
     closed = fractions(A[:n, :n]) + fractions(B[:n]) @ K
     sums: dict[tuple[float, ...], list[tuple[Fraction, Fraction]]] = {}
+    taken = [
+        [_taken(described["set"], (*h, *d), k, n, E, K, closed, sums) for h, d in rows]
+        for k, rows in enumerate(_each_row(H, D))
+    ]
+    return _both_ways(lower, upper, taken)
+
+
+def tightened_by_section(
+    described: Mapping[str, Any], H: Steps, D: Steps, lower: Steps, upper: Steps
+) -> tuple[tuple[Steps, Steps], tuple[Steps, Steps]]:
+    """Return the same bounds of the rows of the nominal trajectory of a tube."""
+    return _both_ways(lower, upper, taken_by_section(described, H, D))
+
+
+def taken_by_section(
+    described: Mapping[str, Any], H: Steps, D: Steps
+) -> list[list[tuple[Fraction, Fraction]]]:
+    """Return what the section of a tube takes from the lower and the upper bound of each row of
+    each step."""
+    K, section, taken = fractions(described["gain"]), described["section"], []
+    for rows in _each_row(H, D):
+        along = [fractions(h) + fractions(d) @ K for h, d in rows]
+        taken.append([(largest(section, -g), largest(section, g)) for g in along])
+    return taken
+
+
+def _each_row(H: Steps, D: Steps) -> Iterator[list[tuple[list[float], list[float]]]]:
+    """Yield the rows (h, d) of each step."""
+    for H_k, D_k in zip(H, D, strict=True):
+        yield list(zip(H_k.tolist(), D_k.tolist(), strict=True))
+
+
+def _both_ways(
+    lower: Steps, upper: Steps, taken: list[list[tuple[Fraction, Fraction]]]
+) -> tuple[tuple[Steps, Steps], tuple[Steps, Steps]]:
+    """Return the bounds less what is taken from each, rounded inwards and rounded outwards."""
     inner: tuple[Steps, Steps] = [], []
     outer: tuple[Steps, Steps] = [], []
-    for k, (H_k, D_k, *sides) in enumerate(zip(H, D, lower, upper, strict=True)):
-        rows = [(*h, *d) for h, d in zip(H_k.tolist(), D_k.tolist(), strict=True)]
-        taken = [_taken(described["set"], row, k, n, E, K, closed, sums) for row in rows]
+    for *sides, here in zip(lower, upper, taken, strict=True):
         for j, (side, sign) in enumerate(zip(sides, (1, -1), strict=True)):
             each = [
                 (value, value) if not np.isfinite(value) else _rounded(value, sign * moved[j])
-                for value, moved in zip(side.tolist(), taken, strict=True)
+                for value, moved in zip(side.tolist(), here, strict=True)
             ]
             ends = np.reshape(each, (-1, 2))
             inner[j].append(ends[:, 1 - j])

@@ -7,7 +7,12 @@ from typing import Any
 import numpy as np
 
 from jaxmpc.checks import fail
-from jaxmpc.verify.stored_policy import fits, tightened
+from jaxmpc.verify.stored_policy import (
+    answer_shape,
+    fits,
+    tightened,
+    tightened_by_section,
+)
 
 
 def label_shapes(attributes: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
@@ -44,7 +49,19 @@ def label_shapes(attributes: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
         what = "its matrices, horizon, rows and axes do not fit each other"
         fail("problem", what, "Overwrite the store")
     shapes: dict[str, tuple[int, ...]] = {"label": (), "status": (), "cut_offset": ()}
+    if by_policies(problem):
+        shapes |= {"cone": (), "answer": answer_shape(problem["disturbance"], N, m)}
     return {**shapes, "plan": (N, m), "start": (n,), "cut_normal": (d,)}
+
+
+def by_policies(problem: Mapping[str, Any]) -> bool:
+    """Return whether labels of a stored problem rest on affine policies or tubes."""
+    return problem.get("disturbance", {}).get("policy") in ("affine", "tube")
+
+
+def nominal(problem: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the stored problem without its disturbances: its rows as they are given."""
+    return {name: value for name, value in problem.items() if name != "disturbance"}
 
 
 def _fits(M: Any, rows: Mapping[str, Any], size: int) -> bool:
@@ -59,7 +76,12 @@ class Constraints:
     upper[k], D[N] being zero, and of each step k < N the motion A[k], B[k], c[k]. widest: lower and
     upper of a robust problem rounded outwards, where lower and upper are rounded inwards; else the
     same. plain: the attribute `problem` of the store, JSON data that `FeasibilityProblem.plain`
-    describes."""
+    describes.
+
+    Of a tube they are those of (z, ζ), whose first step is z_0 = θ − center − G ζ: ζ are states
+    that are not mapped, N is larger by one, and the first input, which moves nothing, equals the
+    second. Under affine policies rows are as given: `exact_policies.py` has the rest.
+    """
 
     def __init__(self, plain: Mapping[str, Any]) -> None:
         """Stack the rows of each step."""
@@ -92,9 +114,13 @@ class Constraints:
         stacked = [[np.concatenate(v) for v in zip(none, *at, strict=True)] for at in rows]
         self.H, self.D, self.lower, self.upper = (list(v) for v in zip(*stacked, strict=True))
         self.widest = self.lower, self.upper
-        if "disturbance" in plain:
-            arrays = self.A[0], self.B[0], self.H, self.D, self.lower, self.upper
-            (self.lower, self.upper), self.widest = tightened(plain["disturbance"], *arrays)
+        described = plain.get("disturbance", {"policy": ""})
+        as_given = self.H, self.D, self.lower, self.upper
+        if described["policy"] == "tightened":
+            both = tightened(described, self.A[0], self.B[0], *as_given)
+            (self.lower, self.upper), self.widest = both
+        if described["policy"] == "tube":
+            (self.lower, self.upper), self.widest = tightened_by_section(described, *as_given)
         ball = plain["ellipsoid"]
         self.P = None if ball is None else np.zeros((n, n))
         if ball is not None:
@@ -108,6 +134,29 @@ class Constraints:
         else:
             self.low = bound(others.get("lower", []), -np.inf)
             self.high = bound(others.get("upper", []), np.inf)
+        if described["policy"] == "tube":
+            self._begin_anywhere(described["section"])
+
+    def _begin_anywhere(self, section: Mapping[str, Any]) -> None:
+        """Put the step z_0 = θ − center − G ζ before all others."""
+        center, G = (np.asarray(section[name], float) for name in ("center", "generators"))
+        (n, m), g = self.sizes, G.shape[1]
+        wider = lambda M: np.pad(M, [(0, g)] * M.ndim)
+        A, B, c = wider(self.A[0]), np.pad(self.B[0], [(0, g), (0, 0)]), wider(self.c[0])
+        start = np.zeros((n + g, n + g))
+        start[:n, :n], start[:n, n:] = np.eye(n), -G
+        self.A, self.B, self.c = [start, *[A] * self.N], [0 * B, *[B] * self.N], [c] * self.N
+        self.c = [-np.append(center, np.zeros(g)), *self.c]
+        self.H = [np.zeros((0, n + g)), *(np.pad(H, [(0, 0), (0, g)]) for H in self.H)]
+        self.D = [np.zeros((0, m)), *self.D]
+        lower, upper = self.widest
+        first = [np.zeros(0)]
+        self.lower, self.upper = first + self.lower, first + self.upper
+        self.widest = first + lower, first + upper
+        self.N, self.moves = self.N + 1, np.append(self.moves[:1], self.moves)
+        self.sizes = n + g, m
+        self.others = np.append(self.others, n + np.arange(g))
+        self.low, self.high = np.append(self.low, -np.ones(g)), np.append(self.high, np.ones(g))
 
     @cached_property
     def equalities(self) -> tuple[list[tuple[int, int]], np.ndarray]:
@@ -149,7 +198,7 @@ class Constraints:
         parts += [*self.widest[0], *self.widest[1]]
         if self.P is not None:
             parts += [self.P, np.array(self.level)]
-        return max(0, *(_bits(v) for v in parts))
+        return max(0, *(bits(v) for v in parts))
 
 
 def _by_step(values: np.ndarray, axes: int, steps: int) -> list[np.ndarray]:
@@ -158,7 +207,7 @@ def _by_step(values: np.ndarray, axes: int, steps: int) -> list[np.ndarray]:
     return list(values) if values.ndim > axes else [values] * steps
 
 
-def _bits(values: Any) -> int:
+def bits(values: Any) -> int:
     """Return the least e ≥ 0 for which values·2ᵉ are whole; what is not finite does not count."""
     values = np.asarray(values, float).ravel()
     values = values[np.isfinite(values) & (values != 0)]

@@ -15,11 +15,13 @@ from jaxmpc.closed_loop.simulation import Run, lyapunov_decrease, simulate
 from jaxmpc.explicit.exact_penalties import ExactPenalty, exact_penalty
 from jaxmpc.feasible.boundary_points import boundary
 from jaxmpc.feasible.map import FeasibleSetMap, map_points
+from jaxmpc.feasible.policy_problem import problem_of
 from jaxmpc.feasible.polytope_growth import is_standard_form
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.grids import grid
-from jaxmpc.mpc.condense import condensed_in_float64, in_float64
+from jaxmpc.mpc.condense import in_float64
 from jaxmpc.mpc.controller import Controller
+from jaxmpc.mpc.policy_rows import condensed_plan
 from jaxmpc.mpc.problem import HARD, MPC, harden
 from jaxmpc.mpc.rows import row_table
 from jaxmpc.mpc.tightening import feedback_gain
@@ -85,7 +87,8 @@ class OfflineReport:
     `recursive_feasibility`, `exact_penalty` and `verify_terminal`. loops: closed loops that were
     simulated, not proved. None, where they do not apply or the time was over.
     notes: the reasons for what is None.
-    variables, rows, condition: sizes of the condensed QP and condition number of its Hessian.
+    variables, rows, condition: sizes of the condensed QP and condition number of its Hessian, of
+    the variables that have a cost.
     """
 
     mpc: MPC
@@ -179,7 +182,7 @@ def offline_report(
     for name, value, least in (("steps", steps, 2), ("loops", loops, 1)):
         whole(name, value, least)
     hard = harden(mpc)
-    problem = FeasibilityProblem.of(hard)
+    problem = problem_of(hard)
     notes: dict[str, str] = {}
 
     budget.say("terminal ingredients")
@@ -208,7 +211,10 @@ def offline_report(
         budget.say(f"closed loops; compile for some {LOOPS:.0f} s")
         pick = np.unique(np.linspace(0, len(inside) - 1, min(loops, len(inside))).astype(int))
         followed = nominal_loops(mpc, inside[pick], steps)
-    condensed = condensed_in_float64(mpc)
+    with jax.enable_x64(True):
+        condensed = condensed_plan(in_float64(mpc))
+    P = np.asarray(condensed.P)
+    costly = np.any(P != 0, axis=1)  # what policies do about disturbances has no cost
     return OfflineReport(
         mpc=mpc,
         feasible_set=fmap,
@@ -219,7 +225,7 @@ def offline_report(
         loops=followed,
         variables=condensed.P.shape[0],
         rows=condensed.C.shape[0],
-        condition=float(np.linalg.cond(np.asarray(condensed.P))),
+        condition=float(np.linalg.cond(P[np.ix_(costly, costly)])),
         notes=notes,
     )
 

@@ -128,7 +128,7 @@ def test_a_robot_has_no_disturbance(capsys):
     assert "--disturbance: given for a robot" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("command", ["sweep", "export", "info", "tune solver"])
+@pytest.mark.parametrize("command", ["export", "tune solver"])
 def test_commands_of_tightened_rows_refuse_others(tmp_path, monkeypatch, capsys, command):
     """In one sentence, and before anything compiles."""
     monkeypatch.chdir(tmp_path)
@@ -138,3 +138,33 @@ def test_commands_of_tightened_rows_refuse_others(tmp_path, monkeypatch, capsys,
     error = capsys.readouterr().err.splitlines()[-1]
     assert "'tube'" in error and 'Give policy="tightened"' in error
     assert not list(tmp_path.glob("*/*"))
+
+
+@pytest.mark.parametrize("policy", ["affine", "tube"])
+def test_sweep_and_verify_commands(tmp_path, monkeypatch, capsys, policy):
+    """A sweep by two shards, begun again with another grid; a problem of another configuration is
+    found."""
+    monkeypatch.chdir(tmp_path)
+    text = TEXT.replace("[disturbance]", f'[disturbance]\npolicy = "{policy}"')
+    (tmp_path / "problem.toml").write_text(text)
+    sweep = "sweep --config problem.toml --output out --grid 20"
+    for shard in ("0/2", "1/2"):
+        assert main([*sweep.split(), "21", "--shard", shard]) in (0, None)
+    for more in ("21 --resume", "22 --overwrite"):
+        assert main([*sweep.split(), *more.split()]) in (0, None)
+        assert main(["verify", "out"]) == 0
+    assert "verified" in capsys.readouterr().out
+    counts = json.loads((tmp_path / "out/summary.json").read_text())["counts"]
+    assert counts["feasible"] > 250 and counts["infeasible"] > 90
+
+
+def test_a_sweep_that_is_refused_leaves_nothing(tmp_path, monkeypatch, capsys):
+    """No folder is made before the problem is found to have labels."""
+    monkeypatch.chdir(tmp_path)
+    large = TEXT.replace("0.2", "3.0").replace('"invariant"', '"none"')
+    for policy, message in (("tightened", "limits cross"), ("affine", "empty or flat")):
+        text = large.replace("[disturbance]", f'[disturbance]\npolicy = "{policy}"')
+        (tmp_path / "problem.toml").write_text(text)
+        assert main([*"sweep --config problem.toml --output out".split()]) == 2
+        assert message in capsys.readouterr().err
+        assert [v.name for v in tmp_path.iterdir()] == ["problem.toml"]

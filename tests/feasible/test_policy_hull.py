@@ -222,7 +222,6 @@ def test_what_takes_one_sequence_refuses_affine_policies():
         lambda: jm.explicit.critical_regions(mpc),
         lambda: jm.explicit.exact_penalty(mpc),
         lambda: jm.feasible.feasible_fraction(mpc, np.zeros((1, 2))),
-        lambda: jm.feasible.sweep_into("nowhere", mpc, [np.zeros(2)] * 2),
     ):
         with pytest.raises(ValueError, match="policy: 'affine'"):
             call()

@@ -29,7 +29,7 @@ from jaxmpc.app.commands.options import (
 )
 from jaxmpc.batches import chosen_devices
 from jaxmpc.checks import fail, require_disk
-from jaxmpc.feasible.stored import StoredMap, sweep_into
+from jaxmpc.feasible.stored import StoredMap, sweep_into, sweep_problem
 from jaxmpc.files import check_results, open_folder, remove_files, versions, write_results
 from jaxmpc.robot_maps.stored_sweep import sweep_robot
 from jaxmpc.store import Store, exists, location
@@ -109,8 +109,9 @@ class Sweep:
       [[outputs]]  optional, repeated: lower <= C x + D u <= upper; stages, names, units; soft
                 with rho, its L1 weight, and quadratic
       [reference]  optional: state and input that closed loops track (jaxmpc tune weights)
-      [disturbance]  optional: w_min, w_max; E of x+ = A x + B u + E w, gain of the policy
-                u = v + gain (x - z): feasible means that all limits are kept for every such w
+      [disturbance]  optional: w_min, w_max; E of x+ = A x + B u + E w; policy = "tightened" |
+                "affine" | "tube"; gain of u = v + gain (x - z), not of "affine": feasible means
+                that a policy of this kind keeps all limits for every such w
       and what jaxmpc tune writes, see its help: [limits] margin, [mpc] H_f, h_f or P_f, level_f,
       [solver]
       [sweep]   all optional: grid, lower, upper, axes, fixed, projection, iterations, dtype
@@ -234,9 +235,10 @@ def linear_sweep(
     Raises ValueError before anything compiles.
     """
     start, path = time.perf_counter(), url or output / "sweep.zarr"
-    region, mpc = configs.sweep_points(config), config.build_mpc()
+    region = configs.sweep_points(config)
     if shard is None:
         check_results(location(path), resume, overwrite, exists(location(path)))
+    problem = sweep_problem(config.build_mpc(), region.axes, region.fixed)
     open_folder(output)
     # Other shards may have made the store, and one may be writing the results.
     old = () if shard else ("map.png", "summary.json")
@@ -253,10 +255,8 @@ def linear_sweep(
 
     found = sweep_into(
         path,
-        mpc,
+        problem,
         region.along,
-        axes=region.axes,
-        fixed=region.fixed,
         iterations=config.sweep.iterations,
         dtype=config.sweep.dtype,
         gap=1e-6 if refine and len(region.axes) <= 3 else None,

@@ -14,7 +14,7 @@ import tyro
 from jaxmpc.app import config as configs
 from jaxmpc.app.commands.options import Switch, at_least, option, print_table
 from jaxmpc.checks import shown
-from jaxmpc.feasible.problem import FeasibilityProblem
+from jaxmpc.feasible.policy_problem import problem_of
 from jaxmpc.verify.stored_map import Verification, find_store, verify_map
 
 # Failures that are printed.
@@ -112,7 +112,7 @@ def contradictions(attributes: Mapping[str, Any], axes: Mapping[str, np.ndarray]
             region = configs.sweep_points(made) if axes else None
             lines = () if region is None else region.along
             view = (None, None) if region is None else (region.axes, region.fixed)
-            built = FeasibilityProblem.of(made.build_mpc(), *view).plain()
+            built = problem_of(made.build_mpc(), *view).plain()
         elif not _is_here(config["robot"]):
             print(
                 f"{config['robot']}: is not here; the map's problem is not built from it again",
