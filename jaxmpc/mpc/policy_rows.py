@@ -28,6 +28,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.scipy.linalg import solve_triangular
 from jax.typing import DTypeLike
 
 from jaxmpc.checks import concrete, fail, require_memory
@@ -38,9 +39,12 @@ from jaxmpc.mpc.tightening import feedback_gain, require_room, without_disturban
 from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.jax_transformations import compiled_lightly, own_modes
 from jaxmpc.qp.linalg import arrays, matmul
+from jaxmpc.qp.problem import QP
 from jaxmpc.sets.convex_sets import Box, Zonotope
 from jaxmpc.sets.minimal_invariant import minimal_robust_invariant_set
 
+# What stands for no bound of a variable.
+LARGE = 1e30
 # Numbers that the solver holds for each of (rows + variables)², about.
 MATRICES = 4
 
@@ -49,12 +53,29 @@ MATRICES = 4
 class PolicyCondensed(Condensed):
     """The condensed QP with the variables of a policy behind those of the plan.
 
-    `layout` is that of the plan's rows; these stand `copies` times at the beginning of C. response:
-    (N, m, N p), what inputs do about disturbances before any M; None for tubes.
+    `layout` is that of the plan's rows; these stand `copies` times at the beginning of C.
+    response_to_disturbances: (N, m, N p), what inputs do about disturbances before any M; None for
+    tubes. extent: (nz,) and (nz, p), by which and by how much for each |θ_i| the entries of a
+    feasible z are bounded; None where inputs have no Box.
     """
 
     response_to_disturbances: Any
+    extent: Any
     copies: int = static()
+
+    def qp(
+        self,
+        theta: Array,
+        reference: Array | None = None,
+        input_reference: Array | None = None,
+        shift: Array | None = None,
+    ) -> QP:
+        """QP at θ (p,), as `Condensed.qp` has it, with its extent, unless rows are shifted."""
+        found = Condensed.qp(self, theta, reference, input_reference, shift)
+        if self.extent is None or shift is not None:
+            return found
+        constant, slope = self.extent
+        return replace(found, extent=constant + matmul(slope, jnp.abs(theta)))
 
     def reach(self, reach: Array) -> Array:
         """Return how far rows move along a unit of length (rows,), as it is."""
@@ -179,6 +200,26 @@ def generator_form(W: Any, dtype: DTypeLike) -> tuple[Array, Array]:
     return jnp.asarray(W.center, dtype), jnp.asarray(W.generators, dtype)
 
 
+def _plan_extent(nominal: Condensed, reach: Array) -> tuple[Array, tuple[Array, Array]]:
+    """Return |Ω⁻¹| (N m, N m), and bounds, of 1 and of each |θ_i|, of the variables of plans whose
+    inputs are within `reach` (N, m) of zero: u = Ψ θ + Ω z + ψ."""
+    size = nominal.Omega.shape[-1]
+    Omega, one = nominal.Omega.reshape(size, size), jnp.eye(size, dtype=reach.dtype)
+    back = jnp.abs(solve_triangular(Omega, one, lower=True, unit_diagonal=True))
+    constant = matmul(back, (reach + jnp.abs(nominal.psi)).ravel())
+    return back, (constant, matmul(back, jnp.abs(nominal.Psi).reshape(size, -1)))
+
+
+def _input_sizes(mpc: MPC, dtype: DTypeLike) -> tuple[Array, Array] | None:
+    """Return the largest |u_i| (m,) and half the width of the limits of inputs; None without a
+    Box."""
+    if not isinstance(mpc.inputs, Box):
+        return None
+    lower, upper = (jnp.asarray(v, dtype) for v in (mpc.inputs.lower, mpc.inputs.upper))
+    large = lambda v: jnp.minimum(v, LARGE)  # no limit: a product with 0 stays 0
+    return large(jnp.maximum(jnp.abs(lower), jnp.abs(upper))), large((upper - lower) / 2)
+
+
 @compiled_lightly(0)
 @own_modes
 def _affine(nominal: Condensed, mpc: MPC) -> PolicyCondensed:
@@ -217,15 +258,44 @@ def _affine(nominal: Condensed, mpc: MPC) -> PolicyCondensed:
     answers = jnp.concatenate([none, answers], axis=1)
     free, zero = jnp.full(len(step), jnp.inf, dtype), jnp.zeros(len(row), dtype)
     d = nominal.d + middle
+    response = u.reshape(N * p, N, m).transpose(1, 2, 0)
+    extent, sizes = None, _input_sizes(mpc, dtype)
+    if sizes is not None and p == g:
+        # Σ_j |U_kj Γ| is at most half the width: of U_kj in units of w, then of M.
+        in_w = jnp.minimum(jnp.max(jnp.abs(_inverse(Gamma)), axis=0), LARGE)
+        most = jnp.tile(sizes[1], N)[:, None] * jnp.tile(in_w, N)
+        back, (plan, of_theta) = _plan_extent(
+            nominal, sizes[0] + matmul(most, jnp.abs(jnp.tile(center, N))).reshape(N, m)
+        )
+        M = matmul(back, most + jnp.abs(response.reshape(N * m, N * p)))[tuple(places.T)]
+        plan = jnp.append(plan, M)
+        of_theta = jnp.pad(of_theta, ((0, len(M)), (0, 0)))
+        # ΣT is at most what the row's value leaves to its bound.
+        above, below = jnp.abs(nominal.upper - d - constant), jnp.abs(nominal.lower - d + constant)
+        room = jnp.minimum(above, below) + matmul(jnp.abs(value), plan)
+        room_of_theta = jnp.abs(nominal.D) + matmul(jnp.abs(value), of_theta)
+        extent = jnp.append(plan, room[row]), jnp.concatenate([of_theta, room_of_theta[row]])
+        extent = jax.lax.stop_gradient(jax.tree.map(lambda v: jnp.minimum(v, LARGE), extent))
     return _widened(
         nominal,
         C=jnp.block([[value, sums], [value, -sums], [answers, -one], [answers, one]]),
         d=jnp.concatenate([d + constant, d - constant, *2 * [reach[row, at, generator]]]),
         lower=jnp.concatenate([-free, nominal.lower, zero - jnp.inf, zero]),
         upper=jnp.concatenate([nominal.upper, free, zero, zero + jnp.inf]),
-        response=u.reshape(N * p, N, m).transpose(1, 2, 0),
+        response=response,
+        extent=extent,
         copies=2,
     )
+
+
+def _inverse(Gamma: Array) -> Array:
+    """Return the inverse of a square matrix, of a diagonal one entry by entry; `LARGE` where there
+    is none."""
+    entries = jnp.diag(Gamma)
+    usual = jnp.where(entries != 0, 1 / jnp.where(entries != 0, entries, 1.0), 0.0)
+    diagonal = jnp.all(Gamma == jnp.diag(entries))
+    other = jnp.nan_to_num(jnp.linalg.inv(Gamma), nan=LARGE, posinf=LARGE, neginf=-LARGE)
+    return jnp.where(diagonal, jnp.diag(usual), other)
 
 
 def tightened_by(section: Zonotope, found: Sequence[Block], gain: Any) -> list[tuple[Any, Any]]:
@@ -248,8 +318,11 @@ def _tube(nominal: Condensed, mpc: MPC, gain: Array, section: Zonotope) -> Polic
     K = jnp.asarray(gain, dtype)
     found, closed = given_blocks(mpc, dtype), A + matmul(B, K)
 
+    def responses(e: Array) -> Array:
+        return jax.lax.scan(lambda e, _: (matmul(closed, e), e), e, length=mpc.horizon + 1)[1]
+
     def along(e: Array) -> Array:
-        _, x = jax.lax.scan(lambda e, _: (matmul(closed, e), e), e, length=mpc.horizon + 1)
+        x = responses(e)
         return _values(found, x, matmul(x[:-1], K.T))
 
     center, generators = (jnp.asarray(v, dtype) for v in (section.center, section.generators))
@@ -261,6 +334,13 @@ def _tube(nominal: Condensed, mpc: MPC, gain: Array, section: Zonotope) -> Polic
     lower, upper = (jnp.concatenate([*side, center[:0]]) for side in zip(*bounds, strict=True))
     count = generators.shape[1]
     one, zero = jnp.eye(count, dtype=dtype), jnp.zeros((count, nominal.C.shape[1]), dtype)
+    extent, sizes = None, _input_sizes(mpc, dtype)
+    if sizes is not None:
+        ends = jnp.concatenate([generators.T, center[None]])
+        inputs = jax.vmap(lambda e: matmul(responses(e)[:-1], K.T))(ends)
+        _, (plan, of_theta) = _plan_extent(nominal, sizes[0] + jnp.sum(jnp.abs(inputs), axis=0))
+        extent = jnp.append(plan, jnp.ones(count, dtype)), jnp.pad(of_theta, ((0, count), (0, 0)))
+        extent = jax.lax.stop_gradient(extent)
     return _widened(
         nominal,
         C=jnp.block([[nominal.C, -moves], [zero, one]]),
@@ -268,12 +348,20 @@ def _tube(nominal: Condensed, mpc: MPC, gain: Array, section: Zonotope) -> Polic
         lower=jnp.concatenate([lower, -jnp.ones(count, dtype)]),
         upper=jnp.concatenate([upper, jnp.ones(count, dtype)]),
         response=None,
+        extent=extent,
         copies=1,
     )
 
 
 def _widened(
-    nominal: Condensed, C: Array, d: Array, lower: Array, upper: Array, response: Any, copies: int
+    nominal: Condensed,
+    C: Array,
+    d: Array,
+    lower: Array,
+    upper: Array,
+    response: Any,
+    extent: Any,
+    copies: int,
 ) -> PolicyCondensed:
     """Return the QP with these rows and as many variables, of which the first are the plan's."""
     more = C.shape[1] - nominal.C.shape[1]
@@ -292,4 +380,6 @@ def _widened(
         lower=lower,
         upper=upper,
     )
-    return PolicyCondensed(**vars(made), response_to_disturbances=response, copies=copies)
+    return PolicyCondensed(
+        **vars(made), response_to_disturbances=response, extent=extent, copies=copies
+    )

@@ -284,6 +284,9 @@ class QP:
             A_ij z_j; 0 or None: to these. Where l and u are differences, such as limits less what
             the present state contributes, the sizes of the limits belong here.
         balls: number of rows of each ball; see below.
+        extent: (n,) ≥ 0, |z_i| ≤ extent_i for every z that keeps the rows, where that is known
+            beforehand, inf where it is not. Proofs that there is no such z use it: by that the
+            rounding of A'y is multiplied. None: only rows that bound one variable alone tell.
 
     For a batch that shares matrices keep P and A unbatched:
     `jax.vmap(solve_qp, in_axes=(QP(P=None, q=0, A=None, l=0, u=0),))`.
@@ -308,6 +311,7 @@ class QP:
     radius: Any = None
     row_sizes: Any = None
     balls: tuple[int, ...] = static(default=())
+    extent: Any = None
 
     @property
     def bounds(self) -> Bounds:
@@ -394,6 +398,10 @@ class QP:
             require_finite("row_sizes", self.row_sizes)
             if concrete(self.row_sizes) and np.any(np.asarray(self.row_sizes) < 0):
                 fail("row_sizes", "holds a negative size", "Sizes are ≥ 0")
+        if self.extent is not None:
+            require_shape("extent", self.extent, (n,), "One size for each entry of q")
+            if concrete(self.extent) and not np.all(np.asarray(self.extent) >= 0):
+                fail("extent", "holds a negative size or NaN", "Sizes are ≥ 0; inf is not known")
         self._validate_balls(m)
 
     def _validate_balls(self, m: int) -> None:

@@ -292,8 +292,9 @@ def farkas(
 
     y is scaled to length one, set to zero against infinite bounds, and corrected on rows
     that bound one variable (`correcting_rows`). `proved` is True when Σ u y⁺ − l y⁻ is below zero
-    by more than the rounding of the sum and of A'y (over the box of the bounded variables); a
-    variable without such a row must have (A'y)_j at rounding level. A zero y proves nothing.
+    by more than the rounding of the sum and of A'y (over the box of the bounded variables, and
+    `QP.extent`); a variable with neither must have (A'y)_j at rounding level. A zero y proves
+    nothing.
     `beyond`: proved also of the program whose rows are widened by `tolerances` (m,), which adds
     Σ tolerance·|y| to the sum.
     """
@@ -311,7 +312,9 @@ def farkas(
     noise = gamma * matmul(jnp.abs(y), jnp.abs(qp.A))
     support = bounds.support(y)
     # What the correction leaves of A'y meets at most |z| ≤ bound / |pivot|.
-    z_max = jnp.where(has_row, bound / jnp.abs(pivot), jnp.where(left <= noise, 0.0, jnp.inf))
+    other = jnp.where(left <= noise, 0.0, jnp.inf)
+    other = other if qp.extent is None else jnp.minimum(other, qp.extent)
+    z_max = jnp.where(has_row, bound / jnp.abs(pivot), other)
     leak = jnp.where(z_max > 0, (2 * left + noise) * z_max, 0.0)
     bound = jnp.sum(jnp.concatenate([support + gamma * jnp.abs(support), leak]))
     proved, beyond = bound < 0, bound + jnp.sum(tolerances * jnp.abs(y)) < 0

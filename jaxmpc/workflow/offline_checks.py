@@ -319,7 +319,9 @@ def nominal_loops(mpc: MPC, x0s: np.ndarray, steps: int) -> NominalLoops:
     """
     n = mpc.system.n
     with jax.enable_x64(True):
-        controller = Controller(in_float64(mpc), ADMM(newton_steps=30))
+        # Plans under policies need more: many of their rows only touch.
+        few = mpc.disturbance is None or mpc.policy == "tightened"
+        controller = Controller(in_float64(mpc), ADMM(newton_steps=30 if few else None))
 
         def loop(x0: jax.Array) -> Run:  # x, or (x, u_{−1}) where input rates are limited
             previous = x0[n:] if len(x0) > n else None

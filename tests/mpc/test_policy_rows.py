@@ -14,6 +14,7 @@ from scipy.optimize import linprog
 import jaxmpc as jm
 from jaxmpc.feasible.policy_hull import policy_hull
 from jaxmpc.feasible.policy_problem import problem_of
+from jaxmpc.mpc.policy_rows import condensed_plan
 from jaxmpc.mpc.tightening import feedback_gain, without_disturbance
 
 A, B = np.array([[1.0, 1.0], [0.0, 1.0]]), np.array([[0.5], [1.0]])
@@ -115,6 +116,44 @@ def require_labels(labels: np.ndarray, status: np.ndarray) -> None:
     np.testing.assert_array_equal(status == jm.Status.SOLVED, labels == 1)
     np.testing.assert_array_equal(status == jm.Status.PRIMAL_INFEASIBLE, labels == -1)
     assert 0 < np.sum(labels == 1) < len(labels)
+
+
+@pytest.mark.parametrize("policy", ["affine", "tube"])
+@pytest.mark.parametrize("gain", [False, True])
+def test_extents_bound_all_solutions(policy, gain):
+    """Those that proofs rest on, against the largest entry of a feasible solution (SciPy)."""
+    mpc = robust(policy, prestabilise=np.asarray(LAW.K) if gain else False)
+    with enable_x64():
+        qp = condensed_plan(mpc).qp(jnp.asarray(STATES[0]))
+        A, l, u, extent = (np.asarray(v) for v in (qp.A, qp.l, qp.u, qp.extent))
+    n = A.shape[1]
+    for i, sign in itertools.product(range(n), (1.0, -1.0)):
+        cost = np.zeros(n)
+        cost[i] = -sign
+        G = np.vstack([A[np.isfinite(u)], -A[np.isfinite(l)]])
+        h = np.append(u[np.isfinite(u)], -l[np.isfinite(l)])
+        most = linprog(cost, G, h, bounds=(None, None))
+        assert most.status == 0 and -most.fun <= extent[i] * (1 + 1e-9)
+    assert extent.max() < 1e3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("policy", "states"),
+    [
+        ("tube", [[4.44520886, 1.96529], [-3.71277832, -2.04230099], [4.28589471, 1.85791424]]),
+        ("affine", [[4.44520886, 1.96529], [3.95302046, 1.31180867], [4.29126811, 1.11685189]]),
+    ],
+)
+def test_that_there_is_no_plan_is_proved_in_float32(policy, states):
+    """They were INACCURATE: no row bounds the variables of policies alone, so that rounding of a
+    Farkas vector could be multiplied by anything."""
+    even = jm.Box([-0.2, -0.2], [0.2, 0.2])
+    last = jm.maximal_invariant_set(SYSTEM, LAW.K, X, U, disturbance=even)
+    controller = jm.Controller(robust(policy, disturbance=even, terminal_set=last, horizon=5))
+    for x0 in states:
+        assert controller.plan(x0).status == jm.Status.PRIMAL_INFEASIBLE
+    assert controller.plan([-3.0, 1.0]).solved
 
 
 def test_affine_plans_are_the_best_of_all():
