@@ -23,7 +23,7 @@ import jaxmpc as jm
 from jaxmpc.qp.admm import ScaledProgram
 from jaxmpc.qp.admm_kernel import iterate_batch
 from jaxmpc.qp.jax_transformations import on_gpu
-from jaxmpc.qp.triton import ROUGH
+from jaxmpc.qp.kernel import ROUGH
 
 PLANS = [("joint", 2**20), ("springs4", 2**20), ("springs8", 2**16)]
 LOOPS, TOLERANCES, STEPS = (64, 1024, 65_536), (1e-3, 1e-5, 1e-7), 50

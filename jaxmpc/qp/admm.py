@@ -34,6 +34,7 @@ from jax import Array
 from jaxmpc.checks import MOST_COUNT, concrete, fail, number, require_real, whole
 from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.jax_transformations import has_kernels, tree_where, varying
+from jaxmpc.qp.kernel import in_one_program, indices
 from jaxmpc.qp.linalg import cholesky, infinity_norm, inverse_root, matmul, precisely, rounding
 from jaxmpc.qp.problem import FREE, QP, Bounds
 from jaxmpc.qp.residuals import (
@@ -47,7 +48,6 @@ from jaxmpc.qp.residuals import (
     terms_of,
 )
 from jaxmpc.qp.status import Status
-from jaxmpc.qp.triton import in_one_program, indices
 
 # Eigenvalue, relative to the mean, below which a direction counts as without curvature, by the
 # size of a number in bytes.

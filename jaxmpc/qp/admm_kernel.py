@@ -17,28 +17,28 @@ from jax import Array
 from jax.typing import DTypeLike
 
 from jaxmpc.pytrees import record
-from jaxmpc.qp import triton
 from jaxmpc.qp.admm import Factor
 from jaxmpc.qp.jax_transformations import LARGE
-from jaxmpc.qp.linalg import matmul
-from jaxmpc.qp.problem import FREE, Bounds
-from jaxmpc.qp.triton import (
+from jaxmpc.qp.kernel import (
     EXACT,
     LEAST,
     ROUGH,
     Product,
     Ref,
     call,
+    dot,
     indices,
     load,
     padded_side,
     program,
     store,
 )
+from jaxmpc.qp.linalg import matmul
+from jaxmpc.qp.problem import FREE, Bounds
 
 # Warps of a program.
 WARPS = 4
-# Bytes of a number of the matrices, as its parts in bfloat16 (`triton.dot`), and most of all these
+# Bytes of a number of the matrices, as its parts in bfloat16 (`kernel.dot`), and most of all these
 # in shared memory: the largest that was tried on an H100, which has 227 KB.
 BYTES, MOST_BYTES = {ROUGH: 4, EXACT: 6}, 153_600
 
@@ -91,7 +91,7 @@ def iterate_batch(
     low_rank = 2 * total(inner) < total(columns)
     # More instances a program where there are programs enough for all of the GPU's processors.
     T = 64 if total(columns) <= 64 and B >= LARGE else LEAST
-    dot = functools.partial(triton.dot, product=product)
+    times = functools.partial(dot, product=product)
 
     offsets = [-matmul(matmul(q, Minv), made.A.T) for Minv in made.Minv]
     if low_rank:
@@ -113,7 +113,9 @@ def iterate_batch(
         tile = Tile(program() * T + indices(T), B, m)
         places = [first + indices(size) for first, size in columns]
         ranks = [first + indices(size) for first, size in inner]
-        within = TileBounds.read(tile, places, bound_refs, matrix_refs[-1] if balls else None, dot)
+        within = TileBounds.read(
+            tile, places, bound_refs, matrix_refs[-1] if balls else None, times
+        )
         alpha = alpha_ref[0]
         t = [tile.load(t_ref, i) for i in places]
         previous, before = t, None
@@ -137,7 +139,7 @@ def iterate_batch(
                 tile.store(ref, i, v)
 
     shapes = [jax.ShapeDtypeStruct((B, m), dtype)] * 2
-    run = call(admm_steps, shapes, WARPS, (-(-B // T),))
+    run = call(admm_steps, shapes, WARPS, -(-B // T))
     return tuple(run(jnp.reshape(alpha, 1).astype(dtype), made.rho, *matrices, *vectors))
 
 

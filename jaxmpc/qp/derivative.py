@@ -34,10 +34,10 @@ from jax import Array
 from jaxmpc.qp.admm import Factor, ScaledProgram
 from jaxmpc.qp.dual import KERNEL_ROWS, inverted, sides
 from jaxmpc.qp.jax_transformations import Undo, in_blocks, on_gpu, repeat_while, true_places
+from jaxmpc.qp.kernel import LEAST, Ref, call, gather, indices, load, store
 from jaxmpc.qp.linalg import definite_solver, matmul
 from jaxmpc.qp.newton import Constants, gram, ridged
 from jaxmpc.qp.problem import QP, Bounds
-from jaxmpc.qp.triton import LEAST, Ref, call, indices, load, store
 
 # Rows of the reduced system at most, where there is no kernel, steps of the method of multipliers,
 # and instances whose matrices of the size of H are in memory at once.
@@ -286,14 +286,13 @@ def _damped(m: int, rows: int, side: int, damping: float, steps: int, dtype: jnp
 
             def M(added: float) -> Array:
                 diagonal = jnp.where(inside, Lambda + added, 1.0)
-                whole = load(S_ref.at[W[:, None], W[None, :]], square)
-                return whole + jnp.where(same, diagonal[:, None], 0.0)
+                return gather(S_ref, W, W, square) + jnp.where(same, diagonal[:, None], 0.0)
 
             inverse = inverted(M(damping), k, count)
             found = jnp.zeros_like(b)
             for _ in range(steps):
-                left = b - jnp.sum(M(0.0) * found[None, :], axis=1)
-                found = found + jnp.sum(inverse * left[None, :], axis=1)
+                left = b - jnp.sum(M(0.0) * found[:, None], axis=0)
+                found = found + jnp.sum(inverse * left[:, None], axis=0)
             return jnp.where(inside, found, 0.0)
 
         # Most instances belong to another kernel, and wait for nothing in this one.

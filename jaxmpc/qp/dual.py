@@ -34,10 +34,10 @@ from jax import Array
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.admm import ScaledProgram
 from jaxmpc.qp.jax_transformations import has_kernels, repeat_while, tree_where, true_places
+from jaxmpc.qp.kernel import LEAST, Ref, barrier, call, gather, indices, load, padded_side, store
 from jaxmpc.qp.linalg import infinity_norm, matmul, solve
 from jaxmpc.qp.problem import FREE, Bounds, sign
 from jaxmpc.qp.residuals import Pair
-from jaxmpc.qp.triton import LEAST, Ref, barrier, call, indices, load, padded_side, store
 
 # Most rows in W.
 MOST_ROWS = 48
@@ -445,8 +445,7 @@ def _search(dual: Dual, rows: int, side: int, steps: MostSteps, *, last: bool) -
             count = jnp.minimum(wanted, rows)
             rank = jnp.cumsum(ones, dtype=jnp.int32) - 1
             joined = in_W & (rank < rows)
-            # (Pallas' interpreter wants places of their own for what is masked, too.)
-            store(order_ref.at[jnp.where(joined, rank, side + i)], i, joined)
+            store(order_ref.at[rank], i, joined)
             store(y_ref.at[i], y, here)
             store(v_ref.at[i], v, here)
             barrier()
@@ -456,7 +455,7 @@ def _search(dual: Dual, rows: int, side: int, steps: MostSteps, *, last: bool) -
             W_rows = WorkingRows(Bounds.of_rows(bounds_W), y_W, v_W)
             change = _best_change(W_rows, S_ref, W, k, count, inside)
             store(change_ref.at[k], change, inside)
-            store(moved_ref.at[jnp.where(inside, W, m + k)], W_rows.y + change, inside)
+            store(moved_ref.at[W], W_rows.y + change, inside)
             barrier()
             new_y = jnp.where(joined, load(moved_ref.at[i], here), y)
 
@@ -491,7 +490,7 @@ def _search(dual: Dual, rows: int, side: int, steps: MostSteps, *, last: bool) -
         store(flags_ref.at[four], flags, (four < 3) & busy)
 
     vectors = [(m, dtype), (m, dtype), (3, jnp.int32)]
-    scratch = [(side + width, jnp.int32), (side, dtype), (m + side, dtype)]
+    scratch = [(side, jnp.int32), (side, dtype), (m, dtype)]
     shapes = [jax.ShapeDtypeStruct((count,), kind) for count, kind in vectors + scratch]
     warps = 1 if width <= 64 and side <= LEAST else 2 if side <= 32 and width <= 128 else 4
     program = call(dual_steps, shapes, warps, aliases={2: 2, 4: 0, 5: 1})
@@ -511,7 +510,7 @@ def _best_change(
     diagonal = jnp.where(inside, rows.soft_diagonal + RIDGE, 1.0)
 
     def S_W() -> Array:
-        return load(S_ref.at[W[:, None], W[None, :]], inside[:, None] & inside[None, :])
+        return gather(S_ref, W, W, inside[:, None] & inside[None, :])
 
     M = S_W() + jnp.where(k[:, None] == k[None, :], diagonal[:, None], 0.0)
     d = solved(M, rows.gradient, k, count)
@@ -520,7 +519,7 @@ def _best_change(
         S, best, least = S_W(), jnp.zeros_like(d), jnp.asarray(jnp.inf, d.dtype)
         for t in (*LENGTHS, jnp.min(rows.stops(d))):
             change = rows.moved(t * d)
-            S_change = jnp.sum(S * change[None, :], axis=1)
+            S_change = jnp.sum(S * change[:, None], axis=0)
             loss = jnp.sum(rows.loss(change, S_change))
             best, least = jnp.where(loss < least, change, best), jnp.minimum(loss, least)
         return best

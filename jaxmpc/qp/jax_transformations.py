@@ -166,7 +166,7 @@ def tree_where(condition: Array, a: T, b: T) -> T:
 
 def on_gpu() -> bool:
     """Return whether programs run by default on a GPU for which there are kernels."""
-    return jax.default_backend() == "gpu" and has_triton()
+    return jax.default_backend() == "gpu" and has_compiler()
 
 
 def has_kernels(rows: int) -> bool:
@@ -175,15 +175,27 @@ def has_kernels(rows: int) -> bool:
 
 
 @functools.cache
-def has_triton() -> bool:
-    """Return whether this JAX has the Triton backend of Pallas, which a later one may lack: then a
-    warning says once what that costs."""
+def has_jax_triton() -> bool:
+    """Return whether jax-triton is installed, which compiles the kernels."""
+    return _can_import("jax_triton") and _can_import("triton")
+
+
+@functools.cache
+def has_compiler() -> bool:
+    """Return whether something compiles kernels: jax-triton, or the Triton backend of Pallas, which
+    a later JAX may lack. Without both a warning says once what that costs."""
+    if has_jax_triton() or _can_import("jax.experimental.pallas.triton"):
+        return True
+    what = "jax-triton is not installed, so no GPU kernel runs and plans take 8 to 10 times as long"
+    cure = "pip install jax-triton, which the extras cuda12 and cuda13 of jaxmpc do"
+    warnings.warn(f"jaxmpc: {what}. Install it: {cure}", stacklevel=2)
+    return False
+
+
+def _can_import(module: str) -> bool:
     try:
-        importlib.import_module("jax.experimental.pallas.triton")
+        importlib.import_module(module)
     except ImportError:
-        what = f"JAX {jax.__version__} has no Triton backend of Pallas, so no GPU kernel runs"
-        cost = "plans take 8 to 10 times as long"
-        warnings.warn(f"jaxmpc: {what} and {cost}. Install 'jax<0.13'", stacklevel=2)
         return False
     return True
 

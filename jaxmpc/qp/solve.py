@@ -43,6 +43,7 @@ from jaxmpc.qp.jax_transformations import (
     tree_where,
     varying,
 )
+from jaxmpc.qp.kernel import EXACT, ROUGH, Product
 from jaxmpc.qp.linalg import (
     arrays,
     cast,
@@ -67,7 +68,6 @@ from jaxmpc.qp.residuals import (
     worst,
 )
 from jaxmpc.qp.status import Status
-from jaxmpc.qp.triton import EXACT, ROUGH, Product
 
 T = TypeVar("T")
 # What a solve may begin from: an earlier solution, or z and y.

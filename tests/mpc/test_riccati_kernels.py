@@ -1,5 +1,5 @@
-"""The GPU kernels of the stage recursions, run by Pallas' interpreter, and batches side by side on
-CPUs, against the scans."""
+"""The GPU kernels of the stage recursions, run without one, and batches side by side on CPUs,
+against the scans."""
 
 import functools
 

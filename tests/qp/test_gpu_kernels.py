@@ -1,22 +1,29 @@
-"""The kernels for GPUs, run by Pallas' interpreter, against the loops of XLA that they replace."""
+"""The kernels for GPUs, run without one, against the loops of XLA that they replace; their texts
+for Triton, run by NumPy in its place; and that Triton compiles them."""
 
+import ast
+import functools
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import triton_in_numpy
 from bench.families import joint
 
 import jaxmpc as jm
-from jaxmpc.qp import admm, derivative, dual, jax_transformations, solve, triton
+from jaxmpc.mpc.stagewise import recursion_kernels
+from jaxmpc.qp import admm, derivative, dual, jax_transformations, kernel, solve
 from jaxmpc.qp.admm import ADMM, ScaledProgram, factorise, iterate, splittings
 from jaxmpc.qp.admm_kernel import iterate_batch, pieces
 from jaxmpc.qp.admm_kernel import suits as suits_kernel
 from jaxmpc.qp.dual import Dual, DualPoint, MostSteps, dual_search, dual_search_kernel
 from jaxmpc.qp.jax_transformations import true_places
+from jaxmpc.qp.triton_source import triton_source
 
 STEPS = 12
 
@@ -182,62 +189,256 @@ def test_plans_by_kernels_are_those_without(soft, x64, monkeypatch):
     np.testing.assert_allclose(found.gap[solved], wanted.gap[solved], atol=1e-9)
 
 
-def lowered(function, states, monkeypatch):
-    """The program of a batch for a GPU, as text; no GPU is needed for it."""
-    mesh_module = pytest.importorskip("jax._src.mesh")
-    if not hasattr(mesh_module, "AbstractDevice"):
-        pytest.skip("this JAX lowers kernels on machines with a GPU alone")
-    for module in (jax_transformations, triton, derivative):
+@pytest.fixture
+def texts(monkeypatch, x64):
+    """The names of kernels that are called, each of which its text computes, too."""
+    names, by_jax = [], kernel.kernel_p.impl
+
+    def both(*args, **params):
+        found, program = by_jax(*args, **params), params["kernel"]
+        text = triton_source(program, params["batched"], params["batch"])
+        by_text = triton_in_numpy.run(text, program, args, params["batch"])
+        # Of a search y and v: the count of its steps may differ by rounding.
+        count = 2 if program.name == "dual_steps" else len(found)
+        for ours, others in zip(found[:count], by_text, strict=False):
+            rounding = 1e3 * np.finfo(ours.dtype).eps * max(1.0, float(jnp.max(jnp.abs(ours))))
+            np.testing.assert_allclose(others, ours, atol=rounding)
+        names.append(program.name)
+        return found
+
+    monkeypatch.setattr(kernel.kernel_p, "impl", both)
+    return names
+
+
+def random_of(dtype):
+    """A source of random arrays of batches of two, of this type."""
+    rng = np.random.default_rng(0)
+    return lambda *shape: jnp.asarray(0.4 * rng.standard_normal((2, *shape)), dtype)
+
+
+def call_admm(**case):
+    made, q, bounds, t = scaled_batch(**case)
+    iterate_batch(made, jnp.asarray(1.7, t.dtype), q, bounds, t, STEPS)
+
+
+def call_search(**case):
+    made, q, bounds, _ = scaled_batch(**case, dtype=jnp.float64)
+    limit, true, steps = jnp.asarray(1e7), jnp.asarray(True), MostSteps(24, 60)
+
+    def search(bounds, cold):
+        dual = Dual(made.A, made.S, bounds, limit)
+        return dual_search_kernel(dual, cold, cold, jnp.int32(0), true, steps)
+
+    cold = jax.vmap(lambda q, b: DualPoint.of(made.A, q, b, jnp.zeros_like(b.l)))(q, bounds)
+    jax.vmap(search)(bounds, cold)
+
+
+def call_damped():
+    S, b = jnp.eye(12) + 0.1, random_of(jnp.float64)(6)
+    W = jnp.array([[2, 5, 7, 12, 12, 12], [0, 1, 2, 3, 4, 12]])
+    jax.vmap(lambda W, b: derivative.damped_kernel(S, W, 0 * b, b, 1e-6, 2))(W, b)
+
+
+def call_in_registers():
+    least = lambda x, y: ([jnp.minimum(x, y)], [jnp.max(x * y), jnp.sum(x)])
+    x, y = random_of(jnp.float64)(6)
+    kernel.in_one_program(least, [(x, 0.0), (y, 1.0)], [6], 2)
+
+
+def call_recursions(dtype):
+    N, n, m, random = 3, 5, 2, random_of(dtype)
+
+    def weights(*shape):
+        W = random(*shape)
+        return W @ W.swapaxes(-1, -2) + jnp.eye(shape[-1], dtype=dtype)
+
+    A, B, Q, R = random(N, n, n), random(N, n, m), weights(N + 1, n, n), weights(N, m, m)
+    gains = jax.vmap(recursion_kernels._riccati_kernel)(Q, R, A, B)
+    gx, gu = random(N + 1, n), random(N, m)
+    jax.vmap(recursion_kernels._tracking_kernel)(*gains, A, B, gx, gu)
+    for adjoint in (False, True):
+        again = functools.partial(recursion_kernels._recurrence_kernel, adjoint=adjoint)
+        jax.vmap(again, in_axes=(None, 0, 0))(A[0], gx[:, 1:], gx[:, 0])
+
+
+@pytest.mark.parametrize(
+    ("calls", "names"),
+    [
+        (lambda: call_admm(n=7, m=11, B=5), {"admm_steps"}),
+        (lambda: call_admm(n=10, m=30, B=4, soft=True, balls=(2, 3)), {"admm_steps"}),
+        (lambda: call_admm(n=8, m=40, B=18, stages=2, dtype=jnp.float64), {"admm_steps"}),
+        (lambda: call_search(n=7, m=11, B=4), {"dual_steps"}),
+        (lambda: call_search(n=20, m=30, B=2, soft=True), {"dual_steps"}),
+        (call_damped, {"damped_steps"}),
+        (call_in_registers, {"in_registers"}),
+        (
+            lambda: [call_recursions(dtype) for dtype in (jnp.float32, jnp.float64)],
+            {"riccati_stages", "tracking_stages", "recurrence_stages"},
+        ),
+    ],
+    ids=["rows", "balls", "stages", "search", "soft", "damped", "registers", "recursions"],
+)
+def test_texts_of_kernels_compute_what_the_kernels_do(calls, names, texts):
+    calls()
+    assert set(texts) == names
+
+
+def test_a_kernel_of_batches_of_batches(texts):
+    """Of arguments that have both axes, one of them, or none, and with a grid of its own."""
+
+    def products(a, b, c, out):
+        i = kernel.program() * 16 + kernel.indices(16)
+        part = kernel.load(a.at[i]) * kernel.load(b.at[i]) + c[0]
+        kernel.store(out.at[i], part)
+
+    one = kernel.call(products, jax.ShapeDtypeStruct((32,), jnp.float64), grid=2)
+    rng = np.random.default_rng(0)
+    a, b = jnp.asarray(rng.standard_normal((3, 2, 32))), jnp.asarray(rng.standard_normal((2, 32)))
+    c = jnp.asarray(rng.standard_normal((3, 1)))
+    inner = jax.vmap(one, in_axes=(0, 0, None))
+    found = jax.vmap(inner, in_axes=(0, None, 0))(a, b, c)
+    np.testing.assert_allclose(found, a * b + c[:, None], rtol=1e-15)
+    found = jax.vmap(inner, in_axes=(1, None, None))(a.swapaxes(0, 1), b, c[0])
+    np.testing.assert_allclose(found, a * b + c[0], rtol=1e-15)
+    with pytest.raises(NotImplementedError, match="no text in Triton for the operation sin"):
+        sines = lambda a, out: kernel.store(out.at[kernel.indices(16)], jnp.sin(a[0]))
+        kernel.call(sines, jax.ShapeDtypeStruct((16,), jnp.float64))(a[0, 0])
+
+
+def test_kernels_traced_by_several_threads_are_those_of_one(x64):
+    """Each keeps its own stores while it is traced."""
+
+    def counts(out):
+        for k in range(60):
+            kernel.store(out.at[kernel.indices(16) + 16 * k], jnp.full(16, k + 1.0))
+
+    def one(_):
+        return kernel.call(counts, jax.ShapeDtypeStruct((960,), jnp.float64))()
+
+    with ThreadPoolExecutor(4) as pool:
+        for found in pool.map(one, range(8)):
+            np.testing.assert_array_equal(found, np.repeat(np.arange(60) + 1.0, 16))
+
+
+def lowered(function, states, monkeypatch, compiler=None):
+    """Lower the program of a batch for a GPU, which needs none; return the texts of its kernels.
+
+    compiler: of (function of Triton, types of its arguments, warps)."""
+    found = []
+
+    def triton_call(
+        *args, kernel, grid, name, num_warps, num_stages, input_output_aliases, out_shape=None
+    ):
+        if compiler is not None:
+            compiler(kernel, [*args, *out_shape], num_warps)
+        found.append(kernel)
+        return [jnp.zeros(v.shape, v.dtype) for v in out_shape]
+
+    monkeypatch.setitem(sys.modules, "jax_triton", SimpleNamespace(triton_call=triton_call))
+    monkeypatch.setattr(kernel, "has_jax_triton", lambda: True)
+    if compiler is None:
+        monkeypatch.setattr(kernel, "triton_function", lambda text: text)
+    for module in (jax_transformations, kernel, derivative):
         monkeypatch.setattr(module, "on_gpu", lambda: True)
-    device = mesh_module.AbstractDevice("NVIDIA H100 80GB HBM3", 132, "gpu")
-    axes = dict(axis_types=(jax.sharding.AxisType.Auto,), abstract_device=device)
-    program = jax.jit(function)
-    try:
-        with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((1,), ("x",), **axes)):
-            return program.trace(states).lower(lowering_platforms=("cuda",)).as_text()
-    except (TypeError, RuntimeError) as error:
-        if "same dtypes" in str(error):
-            raise
-        pytest.skip(f"this JAX lowers kernels on machines with a GPU alone: {error}")
+    jax.jit(function).trace(states).lower(lowering_platforms=("cuda",))
+    return found
 
 
-@pytest.mark.filterwarnings("ignore:The Pallas Triton backend:DeprecationWarning")
 @pytest.mark.parametrize("gradient", [False, True])
 @pytest.mark.first(1)
 def test_kernels_can_be_lowered_for_a_gpu(gradient, x64, monkeypatch):
-    """All operations of the kernels exist in Triton's dialect."""
+    """Their operations have a text in Triton, which is Python."""
     plan = jax.vmap(jm.Controller(joint(), SOLVER).plan)
     if gradient:
         plan = jax.grad(lambda x, plan=plan: jnp.sum(plan(x).cost))
     # ADMM; the search on the dual and corrections, twice (two sizes each), and four loops' judges;
     # derivatives: two halves of three sizes.
-    text = lowered(plan, jnp.asarray(STATES), monkeypatch)
-    assert text.count("xla.gpu.triton") == (17 if gradient else 11)
+    texts = lowered(plan, jnp.asarray(STATES), monkeypatch)
+    assert len(texts) == (17 if gradient else 11)
+    for text in texts:
+        ast.parse(text)
 
 
-@pytest.mark.filterwarnings("ignore:The Pallas Triton backend:DeprecationWarning")
 @pytest.mark.parametrize("soft", [True, False])
 @pytest.mark.first(1)
 def test_kernels_can_be_lowered_outside_64_bit_mode(soft, monkeypatch):
     """Their float64 stays float64 where the mode is off as the program is lowered."""
     mpc = jm.mpc.soften(joint(), 50.0) if soft else joint()
     mpc = jax.tree.map(lambda v: np.asarray(v, np.float32), mpc)
-    text = lowered(jax.vmap(lambda x: jm.solve(mpc, x)), np.float32(STATES), monkeypatch)
-    assert text.count("xla.gpu.triton") > 3 and "f64" in text
+    texts = lowered(jax.vmap(lambda x: jm.solve(mpc, x)), np.float32(STATES), monkeypatch)
+    assert len(texts) > 3 and any("tl.float64" in text for text in texts)
 
 
-def test_without_triton_there_are_no_kernels_and_one_line_says_so(monkeypatch):
-    """Newer versions of JAX may leave it out."""
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert jax_transformations.on_gpu()
-    monkeypatch.setitem(sys.modules, "jax.experimental.pallas.triton", None)
-    jax_transformations.has_triton.cache_clear()
+@pytest.mark.slow
+@pytest.mark.parametrize("architecture", [80, 89, 90, 100])
+def test_triton_compiles_the_kernels(architecture, x64, monkeypatch):
+    """For Ampere, Ada, Hopper and Blackwell, where Triton is installed; no GPU is needed."""
+    triton = pytest.importorskip("triton")
+    from triton.backends.compiler import GPUTarget
+    from triton.compiler import ASTSource
+
+    names = {"float64": "*fp64", "float32": "*fp32", "int32": "*i32"}
+
+    def compiler(function, arguments, warps):
+        types = [names[str(v.dtype)] for v in arguments]
+        signature = dict(zip(function.arg_names, types, strict=True))
+        source = ASTSource(function, signature, {}, {})
+        options = dict(num_warps=warps, num_stages=1)
+        target = GPUTarget("cuda", architecture, 32)
+        made = triton.compile(source, target=target, options=options)
+        assert ".entry" in made.asm["ptx"] and made.metadata.shared < 227_000
+
+    plan = jax.vmap(jm.Controller(joint(), SOLVER).plan)
+    gradient = jax.grad(lambda x: jnp.sum(plan(x).cost))
+    assert lowered(gradient, jnp.asarray(STATES), monkeypatch, compiler)
+
+
+@pytest.mark.filterwarnings("ignore:The Pallas Triton backend:DeprecationWarning")
+@pytest.mark.parametrize("soft", [False, True])
+@pytest.mark.first(1)
+def test_pallas_takes_the_kernels(soft, x64, monkeypatch):
+    """Where jax-triton is not installed. Lowering needs no GPU."""
+    mesh_module = pytest.importorskip("jax._src.mesh")
+    if not hasattr(mesh_module, "AbstractDevice"):
+        pytest.skip("this JAX lowers kernels of Pallas on machines with a GPU alone")
+    monkeypatch.setattr(kernel, "has_jax_triton", lambda: False)
+    for module in (jax_transformations, kernel, derivative):
+        monkeypatch.setattr(module, "on_gpu", lambda: True)
+    device = mesh_module.AbstractDevice("NVIDIA H100 80GB HBM3", 132, "gpu")
+    axes = dict(axis_types=(jax.sharding.AxisType.Auto,), abstract_device=device)
+    mpc = jm.mpc.soften(joint(), 50.0) if soft else joint()
+    program = jax.jit(jax.vmap(jm.Controller(mpc, SOLVER).plan))
     try:
+        with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((1,), ("x",), **axes)):
+            traced = program.trace(jnp.asarray(STATES))
+            text = traced.lower(lowering_platforms=("cuda",)).as_text()
+    except (TypeError, RuntimeError) as error:
+        if "same dtypes" in str(error):
+            raise
+        pytest.skip(f"this JAX lowers kernels of Pallas on machines with a GPU alone: {error}")
+    assert text.count("xla.gpu.triton") >= 11
+
+
+def test_without_a_compiler_there_are_no_kernels_and_one_line_says_so(monkeypatch):
+    """Newer versions of JAX may leave out Pallas' Triton backend."""
+    caches = jax_transformations.has_jax_triton, jax_transformations.has_compiler
+    clear = lambda: [found.cache_clear() for found in caches]
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setitem(sys.modules, "jax_triton", None)
+    clear()
+    try:
+        assert jax_transformations.on_gpu()
+        monkeypatch.setitem(sys.modules, "jax.experimental.pallas.triton", None)
+        clear()
         with pytest.warns(UserWarning, match="no GPU kernel runs and plans take .* Install"):
             assert not jax_transformations.on_gpu()
         assert not jax_transformations.on_gpu()  # without another warning, which would be an error
+        for name in ("jax_triton", "triton"):
+            monkeypatch.setitem(sys.modules, name, ModuleType(name))
+        clear()
+        assert jax_transformations.on_gpu()
     finally:
-        jax_transformations.has_triton.cache_clear()
+        clear()
 
 
 @pytest.mark.parametrize(
@@ -249,5 +450,5 @@ def test_matrices_beyond_shared_memory_are_left_to_xla(n, m, taken, monkeypatch)
     monkeypatch.setattr(jax_transformations, "on_gpu", lambda: True)
     made = SimpleNamespace(A=np.zeros((m, n)))
     suits = lambda dtype, product: suits_kernel(made, (), np.dtype(dtype), product)
-    assert suits("float32", triton.ROUGH) == taken == suits("float32", triton.EXACT)
-    assert not suits("float64", triton.EXACT)
+    assert suits("float32", kernel.ROUGH) == taken == suits("float32", kernel.EXACT)
+    assert not suits("float64", kernel.EXACT)

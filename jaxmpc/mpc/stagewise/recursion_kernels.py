@@ -1,10 +1,10 @@
 """The recursions along the horizon, each one kernel a batch on NVIDIA GPUs.
 
 As a scan every stage is a launch of its own, or several: 5 to 200 µs each whatever the batch. Here
-one warp runs all stages of one problem with the running vector or matrix in its registers (Pallas,
-Triton). On CPUs the matrices of a batch stand side by side (the batch in the last axis, which XLA
-vectorises: 40 µs for 14 states, 7 inputs and 20 stages, 67 as a batched scan). Everywhere else, and
-for derivatives, the scans serve.
+one warp runs all stages of one problem with the running vector or matrix in its registers. On CPUs
+the matrices of a batch stand side by side (the batch in the last axis, which XLA vectorises: 40 µs
+for 14 states, 7 inputs and 20 stages, 67 as a batched scan). Everywhere else, and for derivatives,
+the scans serve.
 
 Long horizons are divided into √N pieces of √N stages on a GPU (`_in_pieces`). In a piece
 y_k = l_k + Φ_k s with the recurrence l from zero, the products Φ of its matrices and its start s:
@@ -21,10 +21,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxmpc.qp import triton
 from jaxmpc.qp.jax_transformations import on_gpu, own_modes
+from jaxmpc.qp.kernel import EXACT, barrier, call, dot, indices, load, padded_side, store
 from jaxmpc.qp.linalg import WAITS, batched, inverse_root_side_by_side, matmul, solve
-from jaxmpc.qp.triton import barrier, call, indices, load, padded_side, store
 
 # Numbers along a side that a warp's registers hold.
 MOST = 32
@@ -299,7 +298,7 @@ def _tracking_kernel(
 def _riccati_kernel(Q: Array, R: Array, A: Array, B: Array) -> Gains:
     N, n, m, dtype = len(R), Q.shape[-1], R.shape[-1], Q.dtype
     side = padded_side(max(n, m))
-    dot = partial(triton.dot, product=triton.EXACT)
+    times = partial(dot, product=EXACT)
 
     def riccati_stages(*refs: Any) -> None:
         Q_ref, R_ref, A_ref, B_ref, closed_ref, K_ref, inverse_ref = refs
@@ -312,9 +311,9 @@ def _riccati_kernel(Q: Array, R: Array, A: Array, B: Array) -> Gains:
             at = lambda ref, given: k if given.ndim == 3 else None
             A_k, B_k = matrix(A_ref, at(A_ref, A), n, n), matrix(B_ref, at(B_ref, B), n, m)
             R_k = matrix(R_ref, k, m, m)
-            BtS = dot(B_k.T, S)
+            BtS = times(B_k.T, S)
             # Gauss-Jordan in place: R + B'SB is definite, no pivoting.
-            G = R_k + dot(BtS, B_k)
+            G = R_k + times(BtS, B_k)
             for j in range(m):
                 along = jnp.sum(jnp.where(row == j, G, 0.0), axis=0)
                 down = jnp.sum(jnp.where(column == j, G, 0.0), axis=1)
@@ -323,13 +322,17 @@ def _riccati_kernel(Q: Array, R: Array, A: Array, B: Array) -> Gains:
                 less = G - down[:, None] * (along * pivot)[None, :]
                 others = jnp.where(column == j, -down[:, None] * pivot, less)
                 G = jnp.where(row == j, pivot_row, others)
-            K = -dot(G, dot(BtS, A_k))
-            closed = A_k + dot(B_k, K)
+            K = -times(G, times(BtS, A_k))
+            closed = A_k + times(B_k, K)
             found = (closed_ref, closed, n, n), (K_ref, K, m, n), (inverse_ref, G, m, m)
             for ref, v, rows, columns in found:
                 inside = (row < rows) & (column < columns)
                 store(ref.at[k, row, column], v, inside)
-            S = matrix(Q_ref, k, n, n) + dot(closed.T, dot(S, closed)) + dot(K.T, dot(R_k, K))
+            S = (
+                matrix(Q_ref, k, n, n)
+                + times(closed.T, times(S, closed))
+                + times(K.T, times(R_k, K))
+            )
             return (S + S.T) / 2
 
         jax.lax.fori_loop(jnp.int32(0), jnp.int32(N), stage, matrix(Q_ref, N, n, n))
