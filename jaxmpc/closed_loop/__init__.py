@@ -7,6 +7,7 @@ summarise_runs             the numbers and the table of many runs -> RunsSummary
 evaluate_runs              limits kept, target reached, settling time and cost -> Outcome
 RobotController            an MPC with the linear models of a robot
 robot_mpc                  the MPC of a robot, from the limits of its model
+enclosed_mpc               the robust MPC whose proofs hold for a nonlinear robot
 draw_disturbances          random sequences of the disturbances of a robust problem
 worst_disturbance          one that brings a closed loop far beyond its limits, by gradient
 LinearFeedback             LQR or PD with clipping, to compare with
@@ -26,6 +27,7 @@ from jaxmpc.closed_loop.disturbances import draw_disturbances, worst_disturbance
 from jaxmpc.closed_loop.environment import Environment, MPCPolicy
 from jaxmpc.closed_loop.estimation import Disturbance, KalmanFilter, Noise
 from jaxmpc.closed_loop.feedback import LinearFeedback
+from jaxmpc.closed_loop.nonlinear_proofs import enclosed_mpc
 from jaxmpc.closed_loop.offset_free import OffsetFreeController, augmented
 from jaxmpc.closed_loop.outcome import evaluate_runs, summarise_runs
 from jaxmpc.closed_loop.robot_controller import RobotController, robot_mpc
@@ -46,6 +48,7 @@ __all__ = [
     "augmented",
     "draw_disturbances",
     "draw_robots",
+    "enclosed_mpc",
     "evaluate_runs",
     "lyapunov_decrease",
     "randomised",

@@ -1,6 +1,7 @@
 """Plants: robots in MuJoCo MJX, and linear systems in their place.
 
 load_robot            a robot by name, or from an MJCF or URDF file -> Robot
+linear_enclosure      a linear model, and a set that holds what it leaves out -> LinearEnclosure
 RobotModel            what a controller predicts of a robot, for jaxmpc.mpc.NonlinearMPC
 tasks                 positions, orientations, distances and energy, for jaxmpc.mpc.Task
 LinearPlant           a linear system with limits, in the place of a robot
@@ -10,6 +11,7 @@ Film                  the same for a notebook, which plays it
 
 from jaxmpc.robots import tasks
 from jaxmpc.robots.film import Film, render, save_video
+from jaxmpc.robots.linear_enclosure import linear_enclosure
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.load import load_robot
 from jaxmpc.robots.robot import RobotModel
@@ -18,6 +20,7 @@ __all__ = [
     "Film",
     "LinearPlant",
     "RobotModel",
+    "linear_enclosure",
     "load_robot",
     "render",
     "save_video",

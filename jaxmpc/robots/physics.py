@@ -60,7 +60,8 @@ class Physics:
             integrator = "mjINT_IMPLICIT" in str(error)
             cure = 'Write integrator="implicitfast"' if integrator else "Take that out of the file"
             fail("model", f"MJX does not support it: {error}", cure)
-        self.rows = blank._impl.efc_J.size > 0
+        self.constraints = len(blank._impl.efc_J)
+        self.rows = self.constraints > 0
         self.tamed = TAMED if self.rows or model.ntendon else {}
         placed = blank._impl.contact.dim.size or np.any(model.eq_type != EQUALITY_OF_JOINTS)
         light = getattr(model, "flg_gravcomp", False) or np.any(model.body_gravcomp)
@@ -112,6 +113,14 @@ class Physics:
         q = normalised(self.joints, x_q)
         _, bias, poses = self._dynamics(own, q, v)
         return self._forced(own, q, v, act, u)[1].replace(qfrc_bias=bias, **poses)
+
+    def balance(self, x: Array, u: Array) -> tuple[Array, Array]:
+        """Return M (nv, nv) and the force f (nv,) at x = (qpos, qvel) under u: a step of an Euler
+        method without constraints goes on with the accelerations M⁻¹ f."""
+        q, v = x[: self.model.nq], x[self.model.nq :]
+        model, data = self._forced({}, q, v, x[:0], u)
+        M, bias, _ = self._dynamics({}, q, v)
+        return M + self._added(model, data, True), data.qfrc_smooth - bias
 
     def _accelerations(self, damped: bool, *point: Any) -> Array:
         """Return the accelerations (nv,) at point = (numbers, q, v, act, u); damped: with the
