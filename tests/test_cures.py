@@ -36,6 +36,7 @@ def test_a_longer_horizon_helps_with_a_terminal_set_alone():
     assert far.volume() > near.volume()
 
 
+@pytest.mark.slow
 def test_a_number_weighs_the_rate_of_one_input():
     one, other = (problem(input_rate_weight=W) for W in (0.01, [[0.01]]))
     one.validate()
@@ -59,6 +60,7 @@ def test_hypotheses_name_no_terminal_set_that_is_not_there():
     assert "the terminal set" not in str(report).replace("requires a terminal set", "")
 
 
+@pytest.mark.slow
 def test_lost_states_between_the_points_of_a_grid():
     """0.05 % of X_4 is lost, less than the distance of a grid's points: samples lie in it."""
     joint = jm.LinearSystem([[1, 0.01], [0, 1]], [0, 0.2], dt=0.01)

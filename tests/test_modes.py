@@ -201,6 +201,7 @@ def in_a_process(check, names):
 
 @pytest.mark.first(1)
 @pytest.mark.parametrize("check", ["shard_map", "explicit"])
+@pytest.mark.slow
 def test_several_devices(check):
     in_a_process(check, FEW)
 

@@ -81,6 +81,7 @@ def test_prestabilise_is_no_leaf(choice):
     assert bool(mpc.prestabilise.on) is choice and repr(mpc.prestabilise) == repr(choice)
 
 
+@pytest.mark.slow
 def test_controller_is_rebuilt_where_it_is_replaced():
     controller, other = jm.Controller(problem()), problem(Q=[100.0, 0.5])
     changed = replace(controller, mpc=other)

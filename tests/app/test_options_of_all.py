@@ -95,6 +95,7 @@ def test_pictures_for_a_column(tmp_path, monkeypatch):
     assert cli.main(["init", "--width", "poster"]) == 2
 
 
+@pytest.mark.slow
 def test_three_states_are_a_body_and_its_projections():
     """Of a chain of three integrators; each panel shows the extent of the set."""
     chain = jm.LinearSystem([[1, 1, 0], [0, 1, 1], [0, 0, 1.0]], [0, 0, 1.0])

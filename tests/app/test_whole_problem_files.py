@@ -108,6 +108,7 @@ def test_old_results_are_read_as_they_were(write):
     assert "constrained_stages" not in stored["mpc"]
 
 
+@pytest.mark.slow
 def test_a_map_with_limited_rates(write, tmp_path):
     """The previous input is a state: by name, zero where nothing is said, or mapped."""
     text = """

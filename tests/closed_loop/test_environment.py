@@ -92,6 +92,7 @@ def test_limits_nan_and_random_plants(environment):
     assert found.violation[2] > 0.005
 
 
+@pytest.mark.slow
 def test_mpc_policy_is_the_controller_and_has_its_derivatives():
     """On a linear plant: where no limit is near the law of the Riccati recursion, elsewhere within
     the limits; finite differences in ξ and target."""

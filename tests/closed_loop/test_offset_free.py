@@ -75,6 +75,7 @@ def nearest(E, e, G, g):
 
 @pytest.mark.first(1)
 @pytest.mark.parametrize("kind", LOADS)
+@pytest.mark.slow
 def test_no_error_on_another_plant(kind, controller):
     """Under loads on the states and an offset of the sensors, whatever the model of the
     disturbance; without one an error remains."""

@@ -99,6 +99,7 @@ class Cubic:
         return x + u + self.a * x**3
 
 
+@pytest.mark.slow
 def test_plants_disturbance_and_references():
     """Any object with `step`; disturbances added; a reference that moves is seen N steps ahead."""
     mpc = problems.scalar(horizon=2, x_max=50.0, u_max=0.5, terminal_cost=np.eye(1))

@@ -54,6 +54,7 @@ def test_learning_lowers_the_loss():
     assert table["random"]["loss, known"] <= table["none"]["loss, known"] * (1 + 1e-5)
 
 
+@pytest.mark.slow
 def test_plans_of_the_expert():
     """The lesson is what Clarabel finds, for the cost as it is written in the script."""
     s = imitation.Settings(steps=1, batch=4, limit=0.5)

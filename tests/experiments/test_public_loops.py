@@ -32,6 +32,7 @@ def follow(one, samples):
         return public.follow(one, samples)
 
 
+@pytest.mark.slow
 def test_aircraft_rides_on_the_limit_of_a_state(loops):
     """A limit of x_0, which no input moves, exceeded by rounding is no proof of anything."""
     descent = replace(loops["aircraft 12"], x0=np.array(ON_LIMIT), references=((20, np.zeros(4)),))

@@ -201,6 +201,7 @@ ALIKE = {
 
 @pytest.mark.first(2)
 @pytest.mark.parametrize("name", ALIKE)
+@pytest.mark.slow
 def test_equalities_as_rows(name):
     written, plain = ALIKE[name]
     volume = jm.feasible_polytope(plain).volume()

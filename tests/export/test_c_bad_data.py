@@ -58,7 +58,7 @@ def fuzzed(source, folder, calls, *options, compiler=COMPILERS[0] if COMPILERS e
     return found, [int(v) for v in done.stdout.splitlines()[-1].split()[1:]]
 
 
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     "case",
     [c if c in ("all", "explicit") else pytest.param(c, marks=pytest.mark.slow)

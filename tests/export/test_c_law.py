@@ -63,6 +63,7 @@ def test_every_state_has_the_input_of_its_region(regions, tmp_path, dtype, error
 
 
 @compiled
+@pytest.mark.slow
 def test_closed_loop_is_the_solvers(tmp_path):
     """With previous inputs in the state: as many numbers as the problem has parameters."""
     system = jm.LinearSystem([[1.0, 0.2], [0.0, 1.0]], [[0.0], [0.2]])

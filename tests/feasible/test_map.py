@@ -209,6 +209,7 @@ class TestIndependenceOf:
         np.testing.assert_array_equal(jm.map_feasible_set(other, points).label, fmap.label)
 
 
+@pytest.mark.slow
 def test_compiles_once_for_all_chunks():
     """One program of each stage, whatever the number of chunks."""
     stages = (

@@ -50,6 +50,7 @@ def test_labels_do_not_depend_on_the_scale_of_rows():
     np.testing.assert_array_equal(twos.labels.plan, unit.labels.plan)
 
 
+@pytest.mark.slow
 def test_programs_of_many_shapes_are_freed():
     """No program of a map outlives `clear_programs`."""
     system = jm.LinearSystem(np.eye(1), np.eye(1))

@@ -86,6 +86,7 @@ def require_uniform(samples):
     assert p_of(counts[some], share[some]) > LEAST_P
 
 
+@pytest.mark.slow
 def test_uniform_on_a_polygon(samples):
     assert samples.x0s.shape == (4096, 2) and samples.chains == 4096
     require_uniform(samples)

@@ -469,6 +469,7 @@ class TestController:
         np.testing.assert_array_equal(after.inputs[:-1], before.inputs[1:])
         np.testing.assert_array_equal(after.inputs[-1], 0)
 
+    @pytest.mark.slow
     def test_same_as_solve_and_under_scan(self):
         mpc = problems.lecture()
         controller = jm.Controller(mpc)

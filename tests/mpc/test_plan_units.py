@@ -313,6 +313,7 @@ def unstable_faults(seeds, n=4):
     return wrong
 
 
+@pytest.mark.slow
 def test_states_that_rest_at_zero():
     """With orthogonal B and equal weights of inputs each state has a move of its own, so that two
     of three states rest, but for rounding, while the first follows its reference."""

@@ -156,6 +156,7 @@ def test_that_there_is_no_plan_is_proved_in_float32(policy, states):
     assert controller.plan([-3.0, 1.0]).solved
 
 
+@pytest.mark.slow
 def test_affine_plans_are_the_best_of_all():
     """Costs are those of a program with all sequences; where that has no policy, the plan is
     proved infeasible; the policy keeps all limits under every sequence."""

@@ -119,6 +119,7 @@ def test_a_wrong_law_is_no_plan(mpc, states, solved, few, monkeypatch):
     same_plans(found, solved)
 
 
+@pytest.mark.slow
 def test_states_that_are_not_finite_alike_or_far(mpc, states, solved, few):
     x = states.copy()
     x[::7] = x[0]

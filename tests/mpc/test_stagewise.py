@@ -274,6 +274,7 @@ def test_rows_that_no_input_moves():
     np.testing.assert_allclose(plan.slack[0], [0.05, 0, 0], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_varying_system_in_the_problem():
     """Numbers and diagonals become matrices and vectors as they do for a constant system."""
     short = dict(horizon=N, inputs=jm.Box(-1, 1), terminal_cost=[1.0] * n)

@@ -95,6 +95,7 @@ symmetrised = partial(jax.tree.map, lambda M: (M + M.T) / 2)
 
 @pytest.mark.first(1)
 @pytest.mark.parametrize("name", ROUTES)
+@pytest.mark.slow
 def test_raw_and_symmetrised_weights_mean_the_same(name):
     """A quadratic form knows the symmetric part alone: plans, costs and derivatives too."""
 

@@ -313,6 +313,7 @@ class TestOptimalValue:
         near(gradient.u[rows], -np.maximum(y, 0)[rows])
         near(gradient.l[rows], np.maximum(-y, 0)[rows])
 
+    @pytest.mark.slow
     def test_every_kind_of_row(self, x64):
         """Soft rows: dV/dc = d, dV/dk = d²/2. Balls: dV/dradius = −|y_b|, dV/dcentre = −y_b."""
         programs = [everything(seed) for seed in range(5)]

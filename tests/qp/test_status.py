@@ -181,6 +181,7 @@ def test_a_bad_program_leaves_the_shared_gradient(mode, x64):
 
 
 @pytest.mark.parametrize("stagewise", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_a_bad_plan_leaves_the_shared_gradient(stagewise):
     """Of the dynamics, which a plan with indefinite Q, with NaN in Q and one from NaN share."""
     A, B = jnp.array([[1.0, 0.1], [0.0, 1.0]]), jnp.array([[0.0], [0.1]])

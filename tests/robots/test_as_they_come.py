@@ -282,6 +282,7 @@ active="false"/></equality><actuator><position joint="a" kp="10" forcerange="-2 
 ctrlrange="-1 1"/></actuator></mujoco>"""
 
 
+@pytest.mark.slow
 def test_report_names_what_the_predictor_ignores():
     robot = load(CHAIN, velocity=3.0)
     report = robot.report()

@@ -145,6 +145,7 @@ def test_linear_model_against_the_c_engine(standing):
     np.testing.assert_allclose(slack, 0.5 * 9.81 * standing.mujoco.body_mass.sum(), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_statics_of_four_feet(quadruped):
     """Torques of rest need what a linear program finds: normal forces alone, of the weight."""
     robot = quadruped.standing(FEET)

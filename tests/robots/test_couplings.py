@@ -75,6 +75,7 @@ def test_linear_models_have_the_couplings(kind):
         np.testing.assert_allclose(follower / driven, slope, rtol=0.1)
 
 
+@pytest.mark.slow
 def test_random_starts_meet_the_couplings():
     robot = coupled("joint")
     states, _ = draw_robots(robot, 20, spread=0.5)
@@ -101,6 +102,7 @@ FINGER = """<joint name="{0}" type="prismatic"><parent link="p"/><child link="{1
 <axis xyz="0 1 0"/><limit lower="0" upper=".04" effort="20" velocity=".2"/>{2}</joint>"""
 
 
+@pytest.mark.slow
 def test_a_mimic_joint_of_a_urdf_gets_no_motor(tmp_path):
     parts = [LIMB.format(name) for name in "pab"]
     parts += [FINGER.format("l", "a", ""), FINGER.format("r", "b", '<mimic joint="l"/>')]

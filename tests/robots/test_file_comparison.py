@@ -393,6 +393,7 @@ type="capsule" mass="1" condim="{1}" friction="{2}"/></body><body pos=".1 0 .35"
         pytest.param((3, 1, 2), "pyramidal ones", marks=pytest.mark.slow),
     ],
 )
+@pytest.mark.slow
 def test_contacts_without_friction_beside_elliptic_cones(given, words):
     """The same motion as in the C engine, but where no model of MJX has it, which is said."""
     model = mujoco.MjModel.from_xml_string(FALLING.format(*given))

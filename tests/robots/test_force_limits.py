@@ -72,6 +72,7 @@ def test_a_robot_without_such_limits_has_no_rows():
 
 @pytest.mark.parametrize("integrator", ["implicitfast", "Euler"])
 @pytest.mark.parametrize("u", [-1.2, 0.52])
+@pytest.mark.slow
 def test_a_servo_at_the_limit_of_its_force_moves_as_in_c(integrator, u):
     """MuJoCo's implicit integrators take the slope of a saturated servo as zero."""
     model = mujoco.MjModel.from_xml_string(SERVO.replace("implicitfast", integrator))

@@ -60,6 +60,7 @@ NARROW_LAST, WIDE_LAST = (True, False), (False, True)
     ],
 )
 @pytest.mark.first(1)
+@pytest.mark.slow
 def test_every_integrator_in_both_precisions(integrator, order):
     """Of one robot, one after the other: JAX remembers how it read MJX's NumPy constants."""
     robot = jm.load_robot(swing(integrator))

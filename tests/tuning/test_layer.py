@@ -33,6 +33,7 @@ def layer():
     return jm.tuning.MPCLayer(MPC, NAMES)
 
 
+@pytest.mark.slow
 def test_at_the_start_it_is_the_problem(layer, x64):
     """And free numbers lead back to what they stand for."""
     theta = layer.init()
@@ -70,6 +71,7 @@ def test_what_is_not_learned_is_fixed():
     assert not jax.tree.leaves(layer) or jax.tree.leaves(layer) == [layer]  # no pytree
 
 
+@pytest.mark.slow
 def test_inputs_without_a_plan_are_within_the_limits():
     """A state far off spoils neither its neighbours nor their gradients."""
     layer = jm.tuning.MPCLayer(MPC)
@@ -92,6 +94,7 @@ def test_inputs_without_a_plan_are_within_the_limits():
         np.testing.assert_allclose(value, alone[name], rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_closed_loop_carries_its_plans(layer):
     theta = layer.init()
 

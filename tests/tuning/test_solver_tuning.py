@@ -82,6 +82,7 @@ def test_gradient_against_differences():
 
 
 @pytest.mark.parametrize("rate", [1e9, -10.0])
+@pytest.mark.slow
 def test_sabotaged_learning_returns_the_given_solver(learned, rate):
     given = learned[0].solver
     with pytest.warns(UserWarning, match="nothing found is better"):

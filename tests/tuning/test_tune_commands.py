@@ -150,6 +150,7 @@ def test_weights_cut_off_resumed_and_read_back(tmp_path, monkeypatch, capsys, gi
     assert after["violated"] == np.mean(beyond)
 
 
+@pytest.mark.slow
 def test_penalties_write_a_solver_that_is_read_back(tmp_path, monkeypatch, capsys, given_starts):
     """With learning itself faked: what was learned is what the file says."""
     rho = np.random.default_rng(0).uniform(0.1, 3, (2, 9))
