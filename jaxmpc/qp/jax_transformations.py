@@ -56,6 +56,9 @@ LONG_PART_CPU, LONG_FEW_CPU, RECURSION_CPU = 64, 8, 16
 # TurboMPC's problem, 4,096 at once: 2.6 µs a solve in one group, 1.6 in groups of 512, 1.2 of 1,024
 # and 256.)
 PART, SMALLER, LEAST = 4, 16, 256
+# Operations of a group's step there that take as long as its launches, where a step says how many
+# it has an instance: of those with many, smaller groups are worth it, of FEWEST at least.
+WORK, FEWEST = 2**30, 32
 # Instances on a GPU from which on the arithmetic, not the launches, takes the time.
 LARGE = 16_384
 # Length of masks from which on their true places are looked up.
@@ -200,8 +203,9 @@ def _can_import(module: str) -> bool:
     return True
 
 
-def group_sizes(batch: int, steps: Steps = "short") -> list[int]:
-    """Return the sizes of the groups of a batch, from the largest; `steps` as in `repeat_while`.
+def group_sizes(batch: int, steps: Steps = "short", work: int = 0) -> list[int]:
+    """Return the sizes of the groups of a batch, from the largest; `steps` and `work` as in
+    `repeat_while`.
 
     A batch of symbolic size (`jax.export`) is one group."""
     if not isinstance(batch, int):
@@ -212,11 +216,12 @@ def group_sizes(batch: int, steps: Steps = "short") -> list[int]:
         if steps == "long":
             return [batch] if batch <= LONG_PART_CPU else [LONG_PART_CPU, LONG_FEW_CPU]
         return [batch] if batch <= GROUPS_CPU[0] else list(GROUPS_CPU)
-    if batch <= PART * LEAST:
+    least = min(max(WORK // max(work, 1), FEWEST), LEAST)
+    if batch <= PART * least:
         return [batch]
     sizes = [batch if steps == "recursion" else -(-batch // PART)]
-    while sizes[-1] > LEAST:
-        sizes.append(max(-(-sizes[-1] // SMALLER), LEAST))
+    while sizes[-1] > least:
+        sizes.append(max(-(-sizes[-1] // SMALLER), least))
     return sizes
 
 
@@ -276,6 +281,7 @@ def repeat_while(
     state: S,
     steps: Steps = "short",
     first: Callable[[C, S], S] | None = None,
+    work: int = 0,
 ) -> S:
     """Return `state` after state = step(constants, state) while is_open(state), a scalar.
 
@@ -284,8 +290,9 @@ def repeat_while(
     file). steps: "long" where a step takes long or few instances are open at first; "recursion"
     where it is one over the stages of a horizon, which on a GPU takes as long for 4,096 instances
     as for 1,024. first: a step that costs less than `step` and may leave an instance as it is: a
-    batch of several groups on a CPU takes it once before all others, without groups. Not
-    differentiable.
+    batch of several groups on a CPU takes it once before all others, without groups. work: about
+    how many operations a step of one instance has, where that is more than its launches take.
+    Not differentiable.
     """
     one = lambda constants, state: lax.while_loop(is_open, lambda s: step(constants, s), state)
     single, state = custom_vmap(one), varying(state, (constants, state))
@@ -301,7 +308,7 @@ def repeat_while(
             return lambda leaves, state: step(jax.tree.unflatten(tree, leaves), state)
 
         begin = None if first is None else on_leaves(first)
-        run = _in_groups(is_open, on_leaves(step), batched, steps, begin)
+        run = _in_groups(is_open, on_leaves(step), batched, steps, begin, work)
         return all_batched(run(tuple(leaves), state))
 
     return single(constants, state)
@@ -313,9 +320,10 @@ def _in_groups(
     batched: tuple[bool, ...],
     steps: Steps,
     first: Callable[[tuple, S], S] | None,
+    work: int,
 ) -> Callable[[tuple, S], S]:
     """Return the loop for a batch, (leaves of the constants, states) → states. batched: which
-    leaves have the batch axis. first: as in `repeat_while`."""
+    leaves have the batch axis. first, work: as in `repeat_while`."""
     axes = tuple(0 if b else None for b in batched), 0
     many, open_ones = jax.vmap(step, in_axes=axes), jax.vmap(is_open)
 
@@ -348,7 +356,7 @@ def _in_groups(
         size = jax.tree.leaves(state)[0].shape[0]
         if not size:
             return state
-        counts = group_sizes(size, steps)
+        counts = group_sizes(size, steps, work)
         if first is not None and jax.default_backend() == "cpu" and counts[0] < size:
             state = begin(first, leaves, state)
         for count, least in zip(counts, [*counts[1:], 0], strict=True):

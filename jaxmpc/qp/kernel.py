@@ -431,10 +431,6 @@ def _equation(eqn: Any, given: list, memory: Any) -> tuple[Any, list]:
         go_on = lambda s: _evaluated(params["cond_jaxpr"], [*given[:enter], *s[1]], s[0])[1][0]
         step = lambda s: _evaluated(params["body_jaxpr"], [*given[enter:body], *s[1]], s[0])
         return lax.while_loop(go_on, step, (memory, given[body:]))
-    if name == "scan":
-        constants, state = given[: params["num_consts"]], given[params["num_consts"] :]
-        again = lambda _, s: _evaluated(params["jaxpr"], [*constants, *s[1]], s[0])
-        return lax.fori_loop(none, jnp.int32(params["length"]), again, (memory, state))
     if name == "cond":
         branches = [partial(_evaluated, branch) for branch in params["branches"]]
         return lax.switch(given[0], branches, given[1:], memory)

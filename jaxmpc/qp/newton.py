@@ -15,6 +15,7 @@ e ≠ 0, which is a Farkas vector: e'A w is 0 for all w but at least g*(e) fails
 and proves that there is no solution where there is none.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 from enum import IntEnum
 from functools import partial
@@ -36,9 +37,16 @@ from jaxmpc.qp.dual import (
     has_dual_steps,
     solve_dual,
 )
-from jaxmpc.qp.jax_transformations import repeat_while, tree_where, varying
+from jaxmpc.qp.jax_transformations import (
+    has_kernels,
+    own_modes,
+    repeat_while,
+    tree_where,
+    varying,
+)
+from jaxmpc.qp.kernel import in_one_program, indices
 from jaxmpc.qp.linalg import infinity_norm, matmul, solve
-from jaxmpc.qp.problem import Bounds
+from jaxmpc.qp.problem import FREE, Bounds
 from jaxmpc.qp.residuals import (
     Pair,
     Proof,
@@ -142,33 +150,97 @@ def newton_step(w: Array, phi: Augmented, A: Array) -> NewtonStep:
     slope, curvature = jnp.sum(d * jnp.stack([matmul(w, H) + q, Hd]), axis=1)
     minimised = jnp.all(bounds.active_set(v + Ad, rho) == bounds.active_set(v, rho))
 
-    Bracket = tuple[Array, Array, Array]
-
-    def bracket(carry: Bracket, _: None) -> tuple[Bracket, None]:
-        """Newton on the derivative of φ, which grows with t, between what it has bracketed."""
-        t, low, high = carry
-        at = v + t * Ad
-        derivative = slope + t * curvature + rho * jnp.sum(bounds.prox_residual(at, rho) * Ad)
-        D, hs = bounds.curvature(at, rho)
-        second = curvature + rho * (jnp.sum(D * Ad**2) + sum(jnp.sum(h * Ad) ** 2 for h in hs))
-        low, high = jnp.where(derivative < 0, t, low), jnp.where(derivative < 0, high, t)
-        move = t - derivative / jnp.maximum(second, jnp.finfo(w.dtype).tiny)
-        middle = jnp.where(jnp.isinf(high), 4 * t, (low + high) / 2)
-        inside = (move > low) & (move < high) & (move < 10 * t)
-        return (jnp.where(inside, move, middle), low, high), None
-
-    one = jnp.ones((), w.dtype)
-    count = LINE_STEPS if bounds.linear is None else LINE_STEPS_SOFT
-    begin = varying((one, 0 * one, jnp.inf * one), (slope, v))
-    (t, low, high), _ = jax.lax.scan(bracket, begin, length=count)
-    # Without an upper bracket the lower end is used.
-    t = jnp.where(minimised, 1.0, jnp.where(jnp.isinf(high), low, t))
+    t = jnp.where(minimised, 1.0, line_minimum(bounds, rho, v, Ad, slope, curvature))
     w_new, e_new = w + t * d, bounds.prox_residual(v + t * Ad, rho)
     if not bounds.balls:
         # The prox residual is linear where the active set does not change. Adding the change keeps
         # the rounding of a small e small; ρ will multiply it.
         e_new = jnp.where(minimised, e + weights * Ad, e_new)
     return NewtonStep(w_new, e_new, matmul(w_new, H) + q + rho * matmul(e_new, A), minimised)
+
+
+def line_minimum(
+    bounds: Bounds, rho: Array | float, v: Array, Ad: Array, slope: Array, curvature: Array
+) -> Array:
+    """Return t ≥ 0 at which slope·t + ½ curvature·t² + min_p g(p) + ½ρ|v + t Ad − p|² is least.
+
+    Without balls a kernel where it runs: as a loop of XLA each of its steps is several launches."""
+    given = bounds, jnp.asarray(rho, v.dtype), v, Ad, slope, curvature
+    if bounds.balls or not has_kernels(len(v)):
+        return _line_minimum(*given)
+    fast = jax.custom_jvp(_line_minimum_in_kernel)
+
+    @fast.defjvp
+    @own_modes
+    def _(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+        return fast(*primals), jax.jvp(_line_minimum, primals, tangents)[1]
+
+    return fast(*given)
+
+
+def _line_minimum_in_kernel(
+    bounds: Bounds, rho: Array, v: Array, Ad: Array, slope: Array, curvature: Array
+) -> Array:
+    def program(three: Array, v: Array, Ad: Array, *columns: Array) -> tuple[list, list[Array]]:
+        i = indices(len(three))
+        slope, curvature, rho = (jnp.sum(jnp.where(i == n, three, 0.0)) for n in range(3))
+        bounds = Bounds.of_rows(columns)
+        step = _bracket(bounds, rho, v, Ad, slope, curvature)
+        again, end = lambda _, carry: step(carry), jnp.int32(_line_steps(bounds))
+        carry = lax.fori_loop(jnp.int32(0), end, again, _first_bracket(slope))
+        return [], [_end_of(carry)]
+
+    three = jnp.stack([slope, curvature, rho])
+    rows = [(v, 0.0), (Ad, 0.0), *zip(bounds.columns, FREE, strict=False)]
+    return in_one_program(program, [(three, 0.0), *rows], [], 1)[1][0]
+
+
+# A step length t, and those that are known to be too small and too large.
+Bracket = tuple[Array, Array, Array]
+
+
+def _line_minimum(
+    bounds: Bounds, rho: Array, v: Array, Ad: Array, slope: Array, curvature: Array
+) -> Array:
+    step = _bracket(bounds, rho, v, Ad, slope, curvature)
+    begin = varying(_first_bracket(slope), (slope, v))
+    again = lambda carry, _: (step(carry), None)
+    return _end_of(lax.scan(again, begin, length=_line_steps(bounds))[0])
+
+
+def _line_steps(bounds: Bounds) -> int:
+    return LINE_STEPS if bounds.linear is None else LINE_STEPS_SOFT
+
+
+def _first_bracket(slope: Array) -> Bracket:
+    one = jnp.ones((), slope.dtype)
+    return one, 0 * one, jnp.inf * one
+
+
+def _end_of(bracket: Bracket) -> Array:
+    """Return t, or where none is known to be too large the largest that is too small."""
+    t, low, high = bracket
+    return jnp.where(high == jnp.inf, low, t)
+
+
+def _bracket(
+    bounds: Bounds, rho: Array, v: Array, Ad: Array, slope: Array, curvature: Array
+) -> Callable[[Bracket], Bracket]:
+    """Return a Newton step on the derivative, which grows with t, between what is bracketed."""
+
+    def step(bracket: Bracket) -> Bracket:
+        t, low, high = bracket
+        at = v + t * Ad
+        derivative = slope + t * curvature + rho * jnp.sum(bounds.prox_residual(at, rho) * Ad)
+        D, hs = bounds.curvature(at, rho)
+        second = curvature + rho * (jnp.sum(D * Ad**2) + sum(jnp.sum(h * Ad) ** 2 for h in hs))
+        low, high = jnp.where(derivative < 0, t, low), jnp.where(derivative < 0, high, t)
+        move = t - derivative / jnp.maximum(second, jnp.finfo(v.dtype).tiny)
+        middle = jnp.where(high == jnp.inf, 4 * t, (low + high) / 2)
+        inside = (move > low) & (move < high) & (move < 10 * t)
+        return jnp.where(inside, move, middle), low, high
+
+    return step
 
 
 def least_distance(
@@ -342,7 +414,9 @@ def improve(
         step = lambda s, _: (tree_where(s.open, advance(most, given, s), s), None)
         s = lax.scan(step, s, length=length)[0]
     else:
-        s = repeat_while(lambda s: s.open, partial(advance, most), given, s, steps="long")
+        m, n = qp.A.shape
+        work = 2 * m * n * n  # of A'DA
+        s = repeat_while(lambda s: s.open, partial(advance, most), given, s, "long", work=work)
         if has_dual_steps(qp.balls, qp.A):
             s = replace(s, best=corrected_end(p, s))
     return s.best, s.proof, ~false, s.idle > max(most // 2, 50)

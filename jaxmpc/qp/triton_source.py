@@ -153,7 +153,7 @@ class _Lines:
     def equation(self, eqn: Any, given: list[str]) -> list[str]:
         """Write an equation; return the names of its results."""
         kind = eqn.primitive.name
-        if kind in ("while", "scan", "cond"):
+        if kind in ("while", "cond"):
             return getattr(self, f"{kind}_")(eqn.params, given)
         if kind == "store":
             ref, (offset, value, mask) = eqn.params["ref"], given
@@ -224,15 +224,6 @@ class _Lines:
         self.depth += 1
         self.assign(state, self.jaxpr(params["body_jaxpr"], [*given[enter:body], *state]))
         self.assign([go], self.jaxpr(params["cond_jaxpr"], [*given[:enter], *state]))
-        self.depth -= 1
-        return state
-
-    def scan_(self, params: dict, given: list[str]) -> list[str]:
-        constants = given[: params["num_consts"]]
-        state = [self.new(text) for text in given[params["num_consts"] :]]
-        self.add(f"for _ in range({params['length']}):")
-        self.depth += 1
-        self.assign(state, self.jaxpr(params["jaxpr"], [*constants, *state]))
         self.depth -= 1
         return state
 

@@ -17,7 +17,7 @@ from bench.families import joint
 
 import jaxmpc as jm
 from jaxmpc.mpc.stagewise import recursion_kernels
-from jaxmpc.qp import admm, derivative, dual, jax_transformations, kernel, solve
+from jaxmpc.qp import admm, derivative, dual, jax_transformations, kernel, newton, solve
 from jaxmpc.qp.admm import ADMM, ScaledProgram, factorise, iterate, splittings
 from jaxmpc.qp.admm_kernel import iterate_batch, pieces
 from jaxmpc.qp.admm_kernel import suits as suits_kernel
@@ -245,6 +245,23 @@ def call_in_registers():
     kernel.in_one_program(least, [(x, 0.0), (y, 1.0)], [6], 2)
 
 
+def call_line_search(soft):
+    made, q, bounds, t = scaled_batch(n=7, m=11, B=3, soft=soft, dtype=jnp.float64)
+
+    def both(bounds, t):
+        given = bounds, 1e3, t, jnp.ones_like(t), jnp.asarray(-5.0), jnp.asarray(1.0)
+        return newton.line_minimum(*given), newton._line_minimum(*given)
+
+    found, wanted = jax.vmap(both)(bounds, t)
+    np.testing.assert_allclose(found, wanted, rtol=1e-12)
+    one = jax.tree.map(lambda v: v[0], bounds)
+    slopes = lambda minimum: jax.grad(
+        lambda s: minimum(one, 1e3, t[0], 1 + 0 * t[0], s, 1.0 + 0 * s)
+    )
+    found, wanted = (slopes(f)(-5.0) for f in (newton.line_minimum, newton._line_minimum))
+    np.testing.assert_allclose(found, wanted, rtol=1e-12)
+
+
 def call_recursions(dtype):
     N, n, m, random = 3, 5, 2, random_of(dtype)
 
@@ -271,14 +288,28 @@ def call_recursions(dtype):
         (lambda: call_search(n=20, m=30, B=2, soft=True), {"dual_steps"}),
         (call_damped, {"damped_steps"}),
         (call_in_registers, {"in_registers"}),
+        (lambda: call_line_search(False), {"in_registers"}),
+        (lambda: call_line_search(True), {"in_registers"}),
         (
             lambda: [call_recursions(dtype) for dtype in (jnp.float32, jnp.float64)],
             {"riccati_stages", "tracking_stages", "recurrence_stages"},
         ),
     ],
-    ids=["rows", "balls", "stages", "search", "soft", "damped", "registers", "recursions"],
+    ids=[
+        "rows",
+        "balls",
+        "stages",
+        "search",
+        "soft",
+        "damped",
+        "registers",
+        "line",
+        "soft line",
+        "recursions",
+    ],
 )
-def test_texts_of_kernels_compute_what_the_kernels_do(calls, names, texts):
+def test_texts_of_kernels_compute_what_the_kernels_do(calls, names, texts, monkeypatch):
+    monkeypatch.setattr(newton, "has_kernels", lambda rows: True)
     calls()
     assert set(texts) == names
 
@@ -352,9 +383,9 @@ def test_kernels_can_be_lowered_for_a_gpu(gradient, x64, monkeypatch):
     if gradient:
         plan = jax.grad(lambda x, plan=plan: jnp.sum(plan(x).cost))
     # ADMM; the search on the dual and corrections, twice (two sizes each), and four loops' judges;
-    # derivatives: two halves of three sizes.
+    # a line search; derivatives: two halves of three sizes.
     texts = lowered(plan, jnp.asarray(STATES), monkeypatch)
-    assert len(texts) == (17 if gradient else 11)
+    assert len(texts) == (18 if gradient else 12)
     for text in texts:
         ast.parse(text)
 

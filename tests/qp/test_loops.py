@@ -73,6 +73,15 @@ def test_nested_batches(axes):
     np.testing.assert_array_equal(found, np.vectorize(collatz)(wanted))
 
 
+def test_groups_are_smaller_where_steps_have_much_work(monkeypatch):
+    """On a GPU: those of 1,024 quadrupeds, of 96 variables and 1,200 rows."""
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert group_sizes(1024, "long") == [1024]
+    assert group_sizes(1024, "long", work=2 * 1200 * 96**2) == [256, 48]
+    assert group_sizes(1024, "long", work=2**40) == [256, 32]
+    assert group_sizes(96, "long", work=2**40) == [96]
+
+
 def test_groups_cover_and_shrink():
     for batch in (1, 31, 256, 257, 4096, 1 << 20):
         sizes = group_sizes(batch)
