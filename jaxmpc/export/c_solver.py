@@ -18,8 +18,8 @@ from jaxmpc.checks import fail, number, require_finite, require_kind, require_sh
 from jaxmpc.export.c_files import CFiles, input_limits, literal
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.plan import WarmStart
+from jaxmpc.mpc.policy_rows import PolicyCondensed
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.mpc.tightening import require_tightened
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.linalg import matmul
 from jaxmpc.qp.status import Status
@@ -63,7 +63,6 @@ def export_c(
     solver = ADMM() if solver is None else solver
     require_kind("mpc", mpc, MPC)
     require_kind("solver", solver, ADMM)
-    require_tightened(mpc, "C code")
     files = CFiles.open(folder, name, dtype, tolerance, TOLERANCE, overwrite)
     with jax.enable_x64(True):
         controller = Controller(mpc, replace(solver, newton_steps=0))
@@ -100,6 +99,7 @@ def _sizes(controller: Controller) -> dict[str, Any]:
         "BALLS": len(c.balls),
         "BALL_ROWS": sum(c.balls),
         "RATES": int(mpc.rate_limited),
+        "WARM": int(not isinstance(c, PolicyCondensed)),
     }
 
 
@@ -136,11 +136,6 @@ def _tables(controller: Controller) -> dict[str, Any]:
         "first_theta": c.Psi[0],
         "first_z": c.Omega[0],
         "first_constant": c.psi[0],
-        "end_theta": c.Phi[N],
-        "end_z": c.Gamma[N],
-        "end_constant": c.phi[N],
-        "tail_gain": c.K_N,
-        "prestabilising_gain": c.K,
     }
     if factor.G is not None:
         tables["G"] = factor.G
@@ -149,11 +144,26 @@ def _tables(controller: Controller) -> dict[str, Any]:
     if c.balls:
         tables |= {"radius": bounds.radius, "ball_rows": np.array(c.balls)}
     tables |= input_limits(mpc)
+    if not isinstance(c, PolicyCondensed):
+        tables |= _of_warm_starts(controller)
+    return {key: np.asarray(value) for key, value in tables.items()}
+
+
+def _of_warm_starts(controller: Controller) -> dict[str, Any]:
+    """The tables by which a plan begins with the one before."""
+    mpc, c = controller.mpc, controller.condensed
+    N = mpc.horizon
+    tables = {
+        "end_theta": c.Phi[N],
+        "end_z": c.Gamma[N],
+        "end_constant": c.phi[N],
+        "tail_gain": c.K_N,
+        "prestabilising_gain": c.K,
+    }
     if mpc.rate_limited:
         tables |= {"last_theta": c.Psi[-1], "last_z": c.Omega[-1], "last_constant": c.psi[-1]}
-    tables["later_move"] = np.array([mpc.moves[b + 1] if b + 1 < N else -1 for b in c.begins], int)
-    tables["later_row"] = _later_rows(controller)
-    return {key: np.asarray(value) for key, value in tables.items()}
+    later = [mpc.moves[b + 1] if b + 1 < N else -1 for b in c.begins]
+    return {**tables, "later_move": np.array(later, int), "later_row": _later_rows(controller)}
 
 
 def _later_rows(controller: Controller) -> np.ndarray:
@@ -224,7 +234,6 @@ def check_fixed_steps(
     Raises ValueError for an invalid problem, bounds of another shape than (n,) and bad counts.
     """
     require_kind("mpc", mpc, MPC)
-    require_tightened(mpc, "C code")
     require_kind("solver", solver, ADMM)
     mpc.require_constant("closed loops need one system for all time steps", "system")
     whole("plans", plans, 1)

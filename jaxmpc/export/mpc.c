@@ -116,6 +116,7 @@ static void direction(int stage, const real *t, const real *l, const real *u, co
   for (int i = 0; i < M; i++) d[i] += b[i] - s[i];
 }
 
+#if NAME_WARM
 /* Scaled t = s + v of the last plan, one step later. */
 static void warm_start(const NAME_memory *memory, const real *l, const real *u, real *t) {
   real z[NZ], x[N], y[M + 1], s[M + 1];
@@ -153,6 +154,7 @@ static void warm_start(const NAME_memory *memory, const real *l, const real *u, 
   project(t, l, u, rho, s);
   for (int i = 0; i < M; i++) t[i] = s[i] + y[i];
 }
+#endif
 
 int NAME_step(NAME_memory *memory, const real x[N], const real *state_reference,
               const real *input_reference, real input[MU], NAME_info *info) {
@@ -180,6 +182,7 @@ int NAME_step(NAME_memory *memory, const real x[N], const real *state_reference,
     t[i] = 0;
   }
   offset(0, q, move, b);
+#if NAME_WARM
   if (memory->warm) {
     /* From the last plan only where it is nearer than nothing: where the first step is shorter. */
     real warm[M + 1], near = 0, cold = 0;
@@ -190,6 +193,7 @@ int NAME_step(NAME_memory *memory, const real x[N], const real *state_reference,
     for (int i = 0; i < M; i++) near += d[i] * d[i];
     for (int i = 0; i < M && near < cold; i++) t[i] = warm[i]; /* NaN is not less */
   }
+#endif
 
   for (int stage = 0; stage < STAGES; stage++) {
     const real *now = rho + stage * M;

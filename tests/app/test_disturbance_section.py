@@ -1,6 +1,8 @@
 """The section [disturbance] of a problem file."""
 
 import json
+import shutil
+import subprocess
 
 import numpy as np
 import pytest
@@ -128,7 +130,7 @@ def test_a_robot_has_no_disturbance(capsys):
     assert "--disturbance: given for a robot" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("command", ["export", "tune solver"])
+@pytest.mark.parametrize("command", ["export --law explicit", "tune solver"])
 def test_commands_of_tightened_rows_refuse_others(tmp_path, monkeypatch, capsys, command):
     """In one sentence, and before anything compiles."""
     monkeypatch.chdir(tmp_path)
@@ -138,6 +140,20 @@ def test_commands_of_tightened_rows_refuse_others(tmp_path, monkeypatch, capsys,
     error = capsys.readouterr().err.splitlines()[-1]
     assert "'tube'" in error and 'Give policy="tightened"' in error
     assert not list(tmp_path.glob("*/*"))
+
+
+@pytest.mark.parametrize("policy", ["affine", "tube"])
+def test_export_command(tmp_path, monkeypatch, policy):
+    """C code of plans under a policy, whose closed loops are not looked at."""
+    monkeypatch.chdir(tmp_path)
+    text = TEXT.replace("[disturbance]", f'[disturbance]\npolicy = "{policy}"')
+    (tmp_path / "problem.toml").write_text(text)
+    options = "--config problem.toml --horizon 2 --iterations 2000 --plans 0 --output out"
+    assert main(["export", *options.split()]) in (0, None)
+    assert "define mpc_WARM 0" in (tmp_path / "out/mpc_sizes.h").read_text()
+    if (compiler := shutil.which("cc")) is not None:
+        strict = "-std=c99 -Wall -Wextra -Wpedantic -Werror -c out/mpc.c -o mpc.o"
+        subprocess.run([compiler, *strict.split()], check=True)
 
 
 @pytest.mark.parametrize("policy", ["affine", "tube"])

@@ -4,6 +4,7 @@ import ctypes
 import shutil
 import subprocess
 from dataclasses import replace
+from functools import partial
 
 import jax
 import numpy as np
@@ -44,6 +45,15 @@ def differing():
     return replace(mpc, system=system, Q=Q, states=states, inputs=inputs, **same)
 
 
+def robust(policy, **changes):
+    """The pendulum, in deviations from where it stands, under disturbances of one state."""
+    law = jm.LinearSystem(pendulum().system.A, pendulum().system.B)
+    return pendulum(
+        system=law, policy=policy, disturbance=jm.Box(-0.02, 0.03),
+        disturbance_matrix=[[1.0], [0.5]], horizon=3, **changes,
+    )  # fmt: skip
+
+
 CASES = {
     "hard": (lambda: problems.joint_o_inf(6), STEPS),
     "all": (
@@ -68,6 +78,8 @@ CASES = {
     "steps that differ": (differing, STEPS),
     "no rows": (lambda: pendulum(states=None, inputs=None), STEPS),
 }  # fmt: skip
+# So few steps solve none of their plans.
+POLICIES = {policy: (partial(robust, policy), STEPS) for policy in ("tube", "affine")}
 
 
 class Compiled:
@@ -100,11 +112,12 @@ class Compiled:
 @compiled
 @pytest.mark.parametrize(
     "case",
-    [c if c == "all" else pytest.param(c, marks=pytest.mark.slow) for c in CASES],
+    [c if c == "all" else pytest.param(c, marks=pytest.mark.slow) for c in (*CASES, *POLICIES)],
 )
 def test_closed_loop_is_the_controllers(case, tmp_path):
     """Two loops, with references and without, beyond the limits at the start of the second."""
-    mpc, solver = CASES[case][0](), CASES[case][1]
+    make, solver = (CASES | POLICIES)[case]
+    mpc = make()
     with jax.enable_x64(True):
         code, law = Compiled(mpc, solver, tmp_path), jm.Controller(mpc, solver)
         system = law.mpc.system
@@ -139,6 +152,22 @@ def test_status_is_true_and_bad_states_are_answered(tmp_path):
         u, status = code.step([bad, 0.0])
         assert status == 3 and u == 0
     assert code.step([0.2, -0.1])[1] == 1  # from a cold start again
+
+
+@compiled
+@pytest.mark.slow
+@pytest.mark.parametrize("policy", ["affine", "tube"])
+def test_many_steps_solve_plans_under_policies(policy, tmp_path):
+    mpc = robust(policy)
+    code = Compiled(mpc, jm.ADMM(iterations=4000, newton_steps=0), tmp_path)
+    with jax.enable_x64(True):
+        controller = jm.Controller(mpc)
+        for x0 in ([0.3, -0.2], [-0.5, 0.6], [0.6, 0.4]):
+            best = controller.plan(x0)
+            u, status = code.step(x0)
+            assert best.solved and (status == 1 or policy == "tube")
+            np.testing.assert_allclose(u, best.inputs[0], atol=1e-5)
+    assert code.step([2.0, 0.0])[1] == 2  # beyond the limits of x_0
 
 
 @compiled

@@ -218,7 +218,6 @@ def test_refusals(fields, message):
 def test_what_takes_one_sequence_refuses_affine_policies():
     mpc = double()
     for call in (
-        lambda: jm.export.export_c(mpc, "nowhere"),
         lambda: jm.explicit.critical_regions(mpc),
         lambda: jm.explicit.exact_penalty(mpc),
         lambda: jm.feasible.feasible_fraction(mpc, np.zeros((1, 2))),
