@@ -1,13 +1,19 @@
-"""Models that nobody here wrote, as their files are: 62, and ten more that came later.
+"""Models that nobody here wrote, as their files are: 62, ten more that came later, and 50 further.
 
 They are those of dm_control's suite, of Gymnasium and Gymnasium-Robotics (MJCF), and of
-example-robot-data (URDF); `pip install "jaxmpc[models]"` brings them. For each one:
+example-robot-data (URDF); `pip install "jaxmpc[models]"` brings them. The further ones are others
+of example-robot-data, and of robosuite, airo-models, armar, dexmate-urdf and cookie-description
+(`pip install --no-deps --target FOLDER`, and FOLDER in PYTHONPATH). For each one:
 
 loads      seconds, or why it is refused
 rest       the set-point: home, how far away the nearest configuration that inputs hold, or none
 solved     share of plans that are SOLVED, fallback of those that violate soft rows, in percent
 kept       share of samples whose state limits are kept to 1 % of their half-width
 worst      the most that a state limit was exceeded, in half-widths
+C          the largest difference of the plant from MuJoCo's C engine after 25 periods of random
+           inputs about the set-point, in units of the state, relative above 1
+drift      how far the C engine moves from the set-point in 25 periods under its input, likewise
+promise    share of plans SOLVED without fallback after which the next state keeps its limits
 ignored    what the predictor does not know, what was left out of the plant
 
 Each model has a process of its own, ended after `seconds`, so that none spoils the others.
@@ -22,6 +28,7 @@ import sys
 import time
 import warnings
 from collections.abc import Callable
+from functools import partial
 from importlib import import_module, util
 from pathlib import Path
 from typing import Any
@@ -79,6 +86,69 @@ MORE: dict[str, tuple[str, dict[str, bool]]] = {
 }
 
 
+# Further models: package, folder in it, name: arguments of load_robot.
+ERD = ("example-robot-data", "")
+FURTHER: dict[tuple[str, str], dict[str, dict[str, bool]]] = {
+    ERD: {
+        "ur_description/urdf/ur3_robot": {},
+        "ur_description/urdf/ur3_gripper": {},
+        "ur_description/urdf/ur5_gripper": {},
+        "ur_description/urdf/ur5_joint_limited_robot": {},
+        "ur_description/urdf/ur10_joint_limited_robot": {},
+        "so_arm_description/urdf/so100": {},
+        "double_pendulum_description/urdf/double_pendulum_simple": {},
+        "double_pendulum_description/urdf/double_pendulum_continuous": {},
+        "asr_twodof_description/urdf/TwoDofs": {},
+        "finger_edu_description/robots/finger_edu": MEND,
+        "solo_description/robots/solo": {},
+        "quadruped_description/urdf/quadruped": {},
+        "laikago_description/urdf/laikago": MEND,
+        "anymal_c_simple_description/urdf/anymal": MEND,
+        "anymal_b_simple_description/robots/anymal-kinova": MEND,
+        "b1_description/urdf/b1": MEND,
+        "b1_description/urdf/b1-z1": MEND,
+        "allegro_hand_description/urdf/allegro_left_hand": MEND,
+        "borinot_description/urdf/borinot_flying_arm_2": {},
+        "hextilt_description/urdf/hextilt_flying_arm_5": {},
+        "talos_data/robots/talos_left_arm": {},
+        "talos_data/robots/talos_full_v2": MEND,
+        "talos_data/robots/talos_reduced_corrected": {},
+        "tiago_description/robots/tiago": MEND,
+        "tiago_description/robots/tiago_dual": MEND,
+        "tiago_pro_description/robots/tiago_pro": MEND,
+        "romeo_description/urdf/romeo_small": MEND,
+        "simple_humanoid_description/urdf/simple_humanoid": {},
+        "g1_description/urdf/g1_29dof_with_hand_rev_1_0": {},
+        "alexander_description/urdf/alexander_v1.lowerBodyOnly": {},
+        "alex_description/urdf/alex_nub_hands": MEND,
+        "centauro_description/urdf/centauro": MEND,
+        "pr2_description/urdf/pr2": MEND,
+        "icub_description/robots/icub": MEND,
+    },
+    ("robosuite", "models/assets/robots"): {
+        f"{name}/robot": {}
+        for name in ("panda", "iiwa", "kinova3", "jaco", "sawyer", "ur5e", "xarm7", "baxter",
+                     "gr1", "spot", "spot_arm", "tiago")
+    },
+    ("airo_models", ""): {
+        "arms/ur3e/ur3e": {},
+        "arms/ur5e/ur5e": {},
+        "grippers/robotiq_2f_85/urdf/robotiq_2f_85": {},
+        "grippers/schunk_egk40/urdf/schunk_egk40": {},
+    },
+    ("armar", "description/urdf"): {"armar6": MEND, "armar4": MEND},
+    ("dexmate_urdf", "robots"): {
+        "humanoid/vega_1/vega_1": MEND,
+        "humanoid/vega_1u/vega_1u": MEND,
+        "humanoid/vega_1/vega_1_gripper": MEND,
+        "hands/f5d6_hand/f5d6_left": MEND,
+        "hands/dexs_gripper/dexs_gripper": MEND,
+        "hands/dexd_gripper/dexd_gripper": MEND,
+    },
+    ("cookie_description", "urdf"): {"cookie": MEND},
+}  # fmt: skip
+
+
 @dataclasses.dataclass(frozen=True)
 class Settings:
     """models: those whose names begin so, none for all. robots: starts, in a tenth of the joint
@@ -112,7 +182,20 @@ def catalogue() -> dict[str, Callable[[], tuple[Any, dict[str, bool]]]]:
         found[f"gr/{name}"] = lambda p=path: (folder("gymnasium_robotics") / p, {})
     for name, (path, options) in (URDF | MORE).items():
         found[f"urdf/{name}"] = lambda p=path, o=options: (robot_data() / f"{p}.urdf", o)
+    for (package, inner), models in FURTHER.items():
+        for path, options in models.items():
+            short = path.split("/")[0 if package == "robosuite" else -1]
+            found[f"further/{package}/{short}"] = partial(further, package, inner, path, options)
     return found
+
+
+def further(
+    package: str, inner: str, path: str, options: dict[str, bool]
+) -> tuple[Path, dict[str, bool]]:
+    """Return the file of a further model and arguments of load_robot."""
+    root = robot_data() if package == ERD[0] else folder(package) / inner
+    kind = "xml" if package == "robosuite" else "urdf"
+    return root / f"{path}.{kind}", options
 
 
 def folder(package: str) -> Path:
@@ -175,6 +258,7 @@ def tried(name: str, s: Settings) -> dict[str, Any]:
     text = " ".join(row["warnings"])
     none, near = "no input holds home", "the nearest configuration"
     row["rest"] = "none" if none in text else "near" if near in text else "home"
+    row |= beside_c(robot, x, u, s.seed)
     if mpc is None:
         return row
     controller = jm.RobotController(robot, mpc, linearize=s.linearize)
@@ -190,13 +274,43 @@ def tried(name: str, s: Settings) -> dict[str, Any]:
     low, high = (np.asarray(v) for v in (robot.state_limits.lower, robot.state_limits.upper))
     excess = (np.maximum(np.maximum(low - xi, xi - high), 0) / width).max(axis=-1)
     low, high = (np.asarray(v) for v in (robot.input_limits.lower, robot.input_limits.upper))
+    promised = (np.asarray(run.status) == jm.Status.SOLVED) & ~np.asarray(run.fallback)
     return row | {
+        "promise": 100 * float(np.mean(excess[:, 1:][promised] <= 0.01)),
         "finite": bool(np.all(np.isfinite(run.states))),
         "solved": 100 * float(np.mean(run.status == jm.Status.SOLVED)),
         "fallback": 100 * float(np.mean(run.fallback)),
         "kept": 100 * float(np.mean(excess <= 0.01)), "worst": float(np.max(excess)),
         "inputs": bool(np.all((low <= run.inputs) & (run.inputs <= high))),
     }  # fmt: skip
+
+
+def beside_c(robot: Any, x: np.ndarray, u: np.ndarray, seed: int) -> dict[str, float]:
+    """Return how far plant and C engine are apart after 25 periods of random inputs about u, and
+    how far the C engine drifts under u."""
+    import jax
+    import mujoco
+
+    model, rng = robot.mujoco, np.random.default_rng(seed)
+    low, high = (np.asarray(v) for v in (robot.input_limits.lower, robot.input_limits.upper))
+    # A tenth of the range, less where that changes a speed by more than 0.1 in a period.
+    effect = np.abs(robot.linearize(x, u).B).max(axis=0)
+    width = np.where(np.isfinite(high - low), (high - low) / 2, np.inf)
+    amplitude = np.minimum(0.1 * width, 0.1 / np.maximum(effect, 1e-9))
+    inputs = np.clip(u + amplitude * rng.uniform(-1, 1, (25, robot.m)), low, high)
+    ends = []
+    for row in (inputs, np.tile(u, (25, 1))):
+        data = mujoco.MjData(model)
+        data.qpos, data.qvel = x[: model.nq], x[model.nq : model.nq + model.nv]
+        data.act = x[model.nq + model.nv :]
+        for held in row:
+            data.ctrl = held
+            mujoco.mj_step(model, data, robot.substeps)
+        ends.append(np.concatenate([data.qpos, data.qvel, data.act]))
+    move = jax.jit(lambda x, rows: jax.lax.scan(lambda x, u: (robot.step(x, u), None), x, rows)[0])
+    plant = np.asarray(move(x, inputs))
+    apart = lambda a, b: float(np.max(np.abs(a - b) / np.maximum(1, np.abs(b))))
+    return {"C": apart(plant, ends[0]), "drift": apart(ends[1], x)}
 
 
 def starts(robot: Any, mpc: Any, x: np.ndarray, s: Settings) -> np.ndarray:
@@ -246,8 +360,8 @@ def run(s: Settings) -> None:
 
 
 TITLE = (
-    f"{'':40}{'n':>4}{'m':>4}{'load s':>8}{'run s':>7}  rest{'solved':>8}{'fallback':>9}"
-    f"{'kept':>7}{'worst':>8}  ignored"
+    f"{'':40}{'n':>4}{'m':>4}{'load s':>8}{'C':>9}{'drift':>9}{'run s':>7}  rest{'solved':>8}"
+    f"{'fallback':>9}{'promise':>8}{'kept':>7}{'worst':>8}  ignored"
 )
 
 
@@ -258,13 +372,14 @@ def line(row: dict[str, Any]) -> str:
         if key in row:
             return f"{name:40}{key}: {row[key]}"
     start = f"{name:40}{row['n']:>4}{row['m']:>4}{row['load']:>8.1f}"
+    start += f"{row['C']:>9.0e}{row['drift']:>9.0e}"
     ignored = "; ".join(row["ignored"])
     if "solved" not in row:
-        return f"{start}{'':7}  {row['rest']:4}{'':32}  {ignored}"
+        return f"{start}{'':7}  {row['rest']:4}{'':40}  {ignored}"
     finite = "" if row["finite"] and row["inputs"] else "NOT FINITE OR BEYOND INPUTS "
     return (
         f"{start}{row['run']:>7.0f}  {row['rest']:4}{row['solved']:>8.1f}{row['fallback']:>9.1f}"
-        f"{row['kept']:>7.1f}{row['worst']:>8.2g}  {finite}{ignored}"
+        f"{row['promise']:>8.1f}{row['kept']:>7.1f}{row['worst']:>8.2g}  {finite}{ignored}"
     )
 
 
