@@ -18,7 +18,7 @@ settings at once. "data" is the loss on these; "matched": seconds until theirs w
 gradient tuning ended with (inf: not within `budget` times its wall time; the table counts what
 they had found after once that time).
 
-    python experiments/tuning/useful.py --robot arm7 --train 768 --validation 256 --test 1024
+    python experiments/tuning/useful.py --robot arm2 --test 1024 --mass 0.1 --damping 0.5 --delay 1
 """
 
 import time
@@ -47,7 +47,8 @@ from jaxmpc.tuning.weights import ClosedLoopObjective, tune_weights
 class Settings:
     """train, validation, test: loops. samples: of each. updates, rate: steps of Adam, and its rate,
     which falls to a tenth along a cosine. mass, damping: shares by which they are off. payload: kg
-    at most. spread: of starts about home, rad and (times 4) rad/s. velocity: limits in place of the
+    at most. delay: samples, 0 or 1, by which inputs come late, of which the controller knows
+    nothing. spread: of starts about home, rad and (times 4) rad/s. velocity: limits in place of the
     file's, times theirs. sigma: first step of CMA-ES and random search's scale, in log(weight)."""
 
     robot: str = "arm2"
@@ -64,6 +65,7 @@ class Settings:
     mass: float = 0.3
     damping: float = 0.5
     payload: float = 0.4
+    delay: int = 0
     spread: float = 0.1
     velocity: float = 0.5
     margin: float = 0.02
@@ -120,6 +122,7 @@ def run(s: Settings) -> None:
     robot = jm.load_robot(s.robot, velocity=(-speed, speed))
     x_ref, u_ref = robot.equilibrium()
     aims = {"reference": np.asarray(robot.coordinates(x_ref)), "input_reference": u_ref}
+    late = {"delay": s.delay, "compensate": False}
     guess, make = law(s, robot)
     loss = ClosedLoopLoss(
         guess["q"] * np.repeat([s.tracking, s.damped], nv),
@@ -142,6 +145,7 @@ def run(s: Settings) -> None:
         loss,
         s.samples,
         variations=known[1],
+        conditions=late,
         mode=s.mode,
         validation=s.validation / (s.train + s.validation),
         updates=s.updates,
@@ -154,7 +158,7 @@ def run(s: Settings) -> None:
     # The oracle of the others, and of the numbers in the column "data".
     start, back = ravel_pytree(raw(parameters))
     problem = ClosedLoopObjective(
-        make, parameters, as_argument(robot), s.samples, loss, *aims.values(), None
+        make, parameters, as_argument(robot), s.samples, loss, *aims.values(), None, late
     )
     total = lambda theta, *rest: problem.total(back(theta), *rest)[0]
     several = Compiled(jax.jit(jax.vmap(total, in_axes=(0, None, None, None, None))))
@@ -193,7 +197,7 @@ def run(s: Settings) -> None:
     )
     base, tests = None, (unseen[0], s.samples)
     for name, (v, count, when) in found.items():
-        r = jm.simulate_many(make(v), robot, *tests, variations=unseen[1], **aims)
+        r = jm.simulate_many(make(v), robot, *tests, variations=unseen[1], **late, **aims)
         losses = np.asarray(jax.vmap(loss)(jax.tree.map(jnp.asarray, r)), float)
         base = losses.mean() if base is None else base
         worst = r.violation.max(axis=1)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 from functools import partial
 from typing import Any
 
@@ -15,7 +15,7 @@ from jax.flatten_util import ravel_pytree
 
 from jaxmpc.arrays import Reals
 from jaxmpc.batches import Devices, chosen_devices, device_bytes, program_bytes
-from jaxmpc.checks import fail, whole
+from jaxmpc.checks import fail, nearest, whole
 from jaxmpc.closed_loop.simulation import Conditions, Each, Run, require_variations, simulate_each
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.problem import MPC, harden
@@ -39,6 +39,9 @@ FORWARD = 32
 # Primitives of linear algebra, of cubic cost.
 FACTORING = ("cholesky", "triangular_solve", "lu", "eigh", "qr", "householder_product", "svd")
 
+# Name, beside the variations of the plants, of the numbers of the loops, by which noise is drawn.
+LOOP = "number of the loop"
+
 # Initial states (B, n), and the variations of the plant with B in front.
 Data = tuple[np.ndarray, dict[str, np.ndarray]]
 
@@ -54,6 +57,7 @@ def tune_weights(
     reference: Reals | None = None,
     input_reference: Reals | None = None,
     variations: Mapping[str, Any] | None = None,
+    conditions: Mapping[str, Any] | None = None,
     solver: ADMM | None = None,
     design_loss: Callable[[MPC], Any] | None = None,
     mode: str = "auto",
@@ -78,6 +82,9 @@ def tune_weights(
         loss: of one run. None: `ClosedLoopLoss` with Q, R and state limits of the problem at the
             start. Do not use `run.stage_cost`: its weights are the Q and R that are tuned.
         reference, input_reference: as in `simulate`, or functions of the values.
+        conditions: what else the loops have, by the names of `simulate`: disturbance,
+            output_disturbance, forecast, previous_input, noise, observer, delay, compensate. Each
+            as it takes it, or a function of the values: so observers are tuned.
         solver: None for 50 ADMM steps and at most 20 Newton steps.
         design_loss: of the problem alone, such as the `feasible_fraction` of sample states.
         mode: "forward" (cost grows with the number of parameters, memory does not), "reverse"
@@ -112,9 +119,12 @@ def tune_weights(
     require_variations(plant, variations, len(x0s))
     if mode not in MODES:
         fail("mode", f"{mode!r}", f"Give one of {', '.join(MODES)}")
-    steps = whole("steps", steps, 1)
+    steps, conditions = whole("steps", steps, 1), dict(conditions or {})
+    require_conditions(conditions)
+    if conditions.get("noise") is not None:
+        variations[LOOP] = np.arange(len(x0s))
     train, test = chosen.split((x0s, variations))
-    require_variations(plant, test[1], len(test[0]))
+    require_variations(plant, {k: v for k, v in test[1].items() if k != LOOP}, len(test[0]))
     start = raw(parameters)
     initial = {name: np.asarray(p.value) for name, p in parameters.items()}
     build = partial(controller_of, make_mpc, solver=SOLVER if solver is None else solver)
@@ -122,7 +132,7 @@ def tune_weights(
     if loss is None:
         aims = (aim(initial) if callable(aim) else aim for aim in (reference, input_reference))
         loss = _default_loss(controller, plant, *aims)
-    given = as_argument(plant), steps, loss, reference, input_reference, design_loss
+    given = as_argument(plant), steps, loss, reference, input_reference, design_loss, conditions
     objective = ClosedLoopObjective(build, parameters, *given)
     objective.check(start, train)
     decides = chosen.decides(parameters, train, test)
@@ -131,6 +141,16 @@ def tune_weights(
     history = descend(start, loops.gradient, loops.validate, optax.adam(0.05), chosen, decides)
     decides["mode"] = loops.mode
     return finished(TuningRun.of_parameters(parameters, history, decides, build))
+
+
+def require_conditions(conditions: Mapping[str, Any]) -> None:
+    """Raise ValueError unless these are names of what a closed loop has beside its references."""
+    names = [f.name for f in fields(Conditions) if not f.name.endswith("reference")]
+    for name in conditions:
+        if name not in names:
+            listed = "are arguments of their own" if name.endswith("reference") else "are not known"
+            what = f"has {name!r}; such conditions {listed}"
+            fail("conditions", what, f"{nearest(name, names)}Give some of {', '.join(names)}")
 
 
 @dataclass(eq=False)
@@ -214,6 +234,7 @@ class ClosedLoopObjective:
     reference: Any
     input_reference: Any
     design_loss: Any
+    conditions: Mapping[str, Any] = field(default_factory=dict)
 
     def arguments(self, theta: Any, x0s: Any, varied: Any, weights: Any) -> tuple:
         """Return the arguments of `total` as arrays of JAX's current precision."""
@@ -231,11 +252,16 @@ class ClosedLoopObjective:
         """Return the weighted mean loss, and the recorded numbers of each loop."""
         given = values(self.parameters, theta)
         controller = self.build(given)
-        aims = (self.reference, self.input_reference)
-        r, s = (aim(given) if callable(aim) else aim for aim in aims)
-        each = Each(x0s.astype(controller.dtype), varied, {})
+        shared = {"reference": self.reference, "input_reference": self.input_reference}
+        shared |= self.conditions
+        shared = {name: v(given) if callable(v) else v for name, v in shared.items()}
+        numbers: Any = None
+        if shared.get("noise") is not None:
+            numbers = varied.get(LOOP, np.arange(len(x0s)))
+        varied = {name: v for name, v in varied.items() if name != LOOP}
+        each = Each(x0s.astype(controller.dtype), varied, {}, numbers)
         run = simulate_each(
-            controller, plant, Conditions(r, s), each, steps=self.steps, checkpoint=checkpoint
+            controller, plant, Conditions(**shared), each, steps=self.steps, checkpoint=checkpoint
         )
         losses = jax.vmap(self.loss)(run)
         total = jnp.sum(jnp.where(weights > 0, weights * losses, 0.0)) / jnp.sum(weights)

@@ -12,6 +12,7 @@ from problems import symmetric
 import jaxmpc as jm
 from jaxmpc.closed_loop.simulation import Run
 from jaxmpc.tuning import weights
+from jaxmpc.tuning.descent import Settings
 from jaxmpc.tuning.losses import ClosedLoopLoss
 from jaxmpc.tuning.parameters import Parameter
 from jaxmpc.tuning.weights import operations, tune_weights
@@ -335,3 +336,46 @@ def test_bad_arguments_before_any_compile(more, message, monkeypatch):
 def test_bad_losses(more, message):
     with pytest.raises(ValueError, match=message):
         ClosedLoopLoss(**{"Q": [1.0, 1.0], "R": [1.0], **more})
+
+
+def test_loops_have_the_conditions_of_simulate(x64):
+    """A delay, a disturbance and noise: the loss is that of `simulate_many` under the same."""
+    x0s, noise = starts(6), jm.closed_loop.Noise(process=0.01, seed=3)
+    conditions = {"delay": 1, "noise": noise, "disturbance": np.tile([0.0, 0.01], (8, 1))}
+    tuned = tune(x0s, loss=LOSS, conditions=conditions, updates=1, validation=0.5, batch=3)
+    at_start = jm.Controller(weighed({k: v.value for k, v in PARAMETERS.items()}), SOLVER)
+    run = jm.closed_loop.simulate_many(at_start, SYSTEM, x0s, 8, **conditions)
+    losses = np.asarray(jax.vmap(LOSS)(jax.tree.map(jnp.asarray, run)))
+    found = {tuned.history.loss[0], tuned.history.validation[0]}
+    train, test = Settings(validation=0.5, batch=3).split((np.arange(6), {}))
+    wanted = losses[train[0]].mean(), losses[test[0]].mean()
+    np.testing.assert_allclose(sorted(found), sorted(wanted), rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_an_observer_is_tuned_through_the_loop(x64):
+    """Its derivative is that of differences."""
+    noise = jm.closed_loop.Noise(process=0.01, measurement=0.03, seed=3)
+
+    def observer(v):
+        return jm.closed_loop.KalmanFilter(SYSTEM, v["process"], 0.03, np.array([[1.0, 0.0]]))
+
+    parameters = {"process": Parameter(0.02, "positive")}
+    objective = weights.ClosedLoopObjective(
+        lambda v: jm.Controller(MPC, SOLVER), parameters, SYSTEM, 8, LOSS, None, None, None,
+        {"observer": observer, "noise": noise},
+    )  # fmt: skip
+    x0s = starts(4)
+    value = lambda theta: objective.total({"process": theta}, SYSTEM, x0s, {}, np.ones(4))[0]
+    at, h = parameters["process"].raw(), 1e-5
+    value = jax.jit(value)
+    wanted = (value(at + h) - value(at - h)) / (2 * h)
+    np.testing.assert_allclose(jax.jit(jax.grad(value))(at), wanted, rtol=1e-5)
+    assert abs(wanted) > 1e-6
+
+
+def test_conditions_that_no_loop_has():
+    with pytest.raises(ValueError, match="conditions: has 'dely'.*Did you mean delay"):
+        tune(conditions={"dely": 1})
+    with pytest.raises(ValueError, match="conditions: has 'reference'.*arguments of their own"):
+        tune(conditions={"reference": np.zeros(2)})
