@@ -200,8 +200,12 @@ def _opened(
         shapes = compiled_shapes(drawn)
         return _File(host, path.stem, velocities, mended, welded, shapes=shapes)
     except (ValueError, ElementTree.ParseError) as error:
-        text = " ".join(str(error).split())
-        fail("model", f"{path} cannot be read: {text.rstrip('.')}", "Mend the file")
+        text = " ".join(str(error).split()).rstrip(".")
+        problem, cure = f"{path} cannot be read: {text}", "Mend the file"
+        if cure in text:  # of an inertia: it has its own cure
+            problem, _, cure = problem.rpartition(f". {cure}")
+            cure = f"Mend the file{cure}"
+        fail("model", problem, cure)
 
 
 def _actuators(path: Path) -> int:

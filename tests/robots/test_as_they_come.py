@@ -240,8 +240,9 @@ def urdf(tmp_path_factory):
 
 def test_inertias_are_mended_on_request(urdf):
     """(1, 2, 6)/100 is no body: the nearest moments with a + b = c are (2, 3, 5)/100."""
-    with pytest.raises(ValueError, match="model: .*inertia.*load it with mend_inertias=True"):
+    with pytest.raises(ValueError, match="model: .*inertia.*load it with mend_inertias=True") as e:
         jm.load_robot(urdf)
+    assert str(e.value).count("Mend the file") == 1
     robot = jm.load_robot(urdf, mend_inertias=True)
     m = robot.mujoco
     np.testing.assert_allclose(np.sort(m.body("leg").inertia), [0.02, 0.03, 0.05], rtol=1e-6)
