@@ -46,6 +46,8 @@ from jaxmpc.pytrees import record
 from jaxmpc.qp.admm import ADMM, DEFAULT
 from jaxmpc.sets.convex_sets import Polytope
 
+# Entries of a normal that are rounding, beside its largest: points are proved whatever they are.
+ROUNDING = 1e-12
 # Chains side by side, and points of a trial that looks for facets.
 CHAINS, TRIAL = 4096, 512
 # Steps between two points of a chain that are kept, for each coordinate. A step takes 1/d of what a
@@ -290,6 +292,9 @@ class Bounds(NamedTuple):
         valid = np.isfinite(found.offsets)
         normals = np.concatenate([self.normals, found.normals[valid]])
         offsets = np.concatenate([self.offsets, found.offsets[valid]])
+        # Entries that are rounding would spoil the scaling of programs over them.
+        size = np.abs(normals).max(axis=1, keepdims=True)
+        normals = np.where(np.abs(normals) < ROUNDING * size, 0.0, normals)
         try:
             body = Polytope(normals, offsets).reduce()
         except ValueError:  # too ill-conditioned: more than are needed
@@ -379,8 +384,12 @@ class Chains:
 def walk(
     y: Array, rows: Array, offsets: Array, directions: Array, slopes: Array, seed: Any, steps: Array
 ) -> Array:
-    """Return where chains y (C, d) are after hit-and-run steps in rows y ≤ offsets."""
-    key = jax.random.key(seed)
+    """Return where chains y (C, d) are after hit-and-run steps in rows y ≤ offsets.
+
+    The room that is left to each row (C, F) is most of the work, and is kept in float32: where a
+    chain turns is off by as much, beside the size of the set. Places are in float64.
+    """
+    key, slopes = jax.random.key(seed), slopes.astype(jnp.float32)
 
     def step(carry: tuple[Array, Array], i: Array) -> tuple[Any, None]:
         y, room = carry
@@ -391,10 +400,10 @@ def walk(
         far = jnp.maximum(room, 0.0) / slope
         high = jnp.min(jnp.where(slope > 0, far, jnp.inf), axis=1)
         low = jnp.max(jnp.where(slope < 0, far, -jnp.inf), axis=1)
-        t = (low + jax.random.uniform(second, (len(y),), y.dtype) * (high - low))[:, None]
+        t = (low + jax.random.uniform(second, (len(y),), room.dtype) * (high - low))[:, None]
         return (y + t * directions[which], room - t * slope), None
 
-    start = y, offsets - y @ rows.T
+    start = y, (offsets - y @ rows.T).astype(jnp.float32)
     return jax.lax.scan(step, start, steps)[0][0]
 
 
