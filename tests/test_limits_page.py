@@ -82,7 +82,7 @@ def test_offset_free_control_has_one_linear_model():
 
 
 def test_jax_has_an_upper_bound():
-    says("so `jax` has an upper bound")
+    says("have an upper bound of `jax`")
     project = (Path(__file__).resolve().parents[1] / "pyproject.toml").read_text()
     assert re.search(r'"jax>=[\d.]+,<[\d.]+"', project)
 
