@@ -60,8 +60,9 @@ def stack_horizons(problems: Sequence[MPC]) -> MPC:
         plans = jax.vmap(jm.solve)(jm.mpc.stack_horizons(problems), x0s)
         plans.inputs[i, : problems[i].horizon]
 
-    The problems have the same sizes, kinds of limits and settings, or ValueError says which differs
-    from the first one.
+    problems: a list of them, of the same sizes, kinds of limits and settings.
+
+    Raises ValueError with the number of a problem that differs from the first one.
     """
     if not isinstance(problems, Sequence) or not problems:
         fail("problems", f"is a {type(problems).__name__} without problems", "Give a list of MPCs")
