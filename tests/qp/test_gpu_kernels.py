@@ -285,7 +285,9 @@ def call_recursions(dtype):
         (lambda: call_admm(n=10, m=30, B=4, soft=True, balls=(2, 3)), {"admm_steps"}),
         (lambda: call_admm(n=8, m=40, B=18, stages=2, dtype=jnp.float64), {"admm_steps"}),
         (lambda: call_search(n=7, m=11, B=4), {"dual_steps"}),
-        (lambda: call_search(n=20, m=30, B=2, soft=True), {"dual_steps"}),
+        pytest.param(
+            lambda: call_search(n=20, m=30, B=2, soft=True), {"dual_steps"}, marks=pytest.mark.slow
+        ),
         (call_damped, {"damped_steps"}),
         (call_in_registers, {"in_registers"}),
         (lambda: call_line_search(False), {"in_registers"}),
