@@ -171,7 +171,8 @@ class StoredPolicies:
             section = described["section"]
             self.section = Dyadic.of(section["center"]), Dyadic.of(section["generators"])
             taken = taken_by_section(described, self.rows.H, self.rows.D)
-            self.taken = [[Dyadic.of_fractions(v) for v in np.transpose(k)] for k in taken]
+            columns = [np.array(k, object).T for k in taken]
+            self.taken = [[Dyadic.of_fractions(v) for v in pair] for pair in columns]
         self.state, self.plan, self.answer = (
             np.asarray(arrays[f"policy_{name}"], float) for name in ("state", "plan", "answer")
         )
