@@ -7,7 +7,7 @@ import numpy as np
 from jaxmpc.arrays import Reals, as_weight
 from jaxmpc.checks import require_kind, whole
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.robots.linear_enclosure import LinearEnclosure
+from jaxmpc.robots.linear_enclosures import LinearEnclosure
 from jaxmpc.sets.convex_sets import Box, translated
 from jaxmpc.sets.invariant import maximal_invariant_set
 from jaxmpc.systems.riccati import lqr

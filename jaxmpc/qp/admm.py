@@ -34,7 +34,7 @@ from jax import Array
 from jaxmpc.checks import MOST_COUNT, concrete, fail, number, require_real, whole
 from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.jax_transformations import has_kernels, tree_where, varying
-from jaxmpc.qp.kernel import in_one_program, indices
+from jaxmpc.qp.kernel import in_one_program
 from jaxmpc.qp.linalg import cholesky, infinity_norm, inverse_root, matmul, precisely, rounding
 from jaxmpc.qp.problem import FREE, QP, Bounds
 from jaxmpc.qp.residuals import (
@@ -490,15 +490,15 @@ def measure_pair_in_kernel(
     zero = None if known is None else 0.0
     fills = jax.tree.leaves(((0.0, free, zero, 0.0, 0.0, none), (0.0,) * 4, 0.0, free))
 
-    def measure(three: Array, *given: Array) -> tuple[list[Array], list[Array]]:
-        i = indices(len(three))
-        eps, gap, unit = (jnp.sum(jnp.where(i == n, three, 0.0)) for n in range(3))
+    def measure(
+        eps: Array, gap: Array, unit: Array, *given: Array
+    ) -> tuple[list[Array], list[Array]]:
         vectors, sizes, E, scaled = jax.tree.unflatten(tree, given)
         found, gradient = measure_pair(eps, vectors, replace(sizes, gap=gap), E, unit, scaled)
         return [gradient], jax.tree.leaves(found)
 
-    data = [(jnp.stack([eps, sizes.gap, unit]), 0.0), *zip(given, fills, strict=True)]
-    [gradient], numbers = in_one_program(measure, data, [len(z)], 7)
+    data = list(zip(given, fills, strict=True))
+    [gradient], numbers = in_one_program(measure, [eps, sizes.gap, unit], data, [len(z)], 7)
     primal, dual, gap, within, error, near, finished = numbers
     measured = Measured(primal, dual, gap, within > 0)
     return (measured, error, near > 0, finished > 0), gradient

@@ -26,6 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 from jax.custom_batching import custom_vmap
+from jax.extend.core import ClosedJaxpr
 from jax.sharding import AxisType, PartitionSpec, auto_axes, get_abstract_mesh
 
 from jaxmpc.checks import concrete
@@ -61,6 +62,8 @@ PART, SMALLER, LEAST = 4, 16, 256
 WORK, FEWEST = 2**30, 32
 # Instances on a GPU from which on the arithmetic, not the launches, takes the time.
 LARGE = 16_384
+# Operations of a jaxpr that call a program once.
+CALLS = {"jit", "pjit", "closed_call", "custom_jvp_call", "custom_vmap_call", "remat"}
 # Length of masks from which on their true places are looked up.
 LONG = 65_536
 # Most rows that a kernel takes: a program's registers hold no more.
@@ -160,6 +163,29 @@ def _apart(tree: T) -> T:
 @_apart.defjvp
 def _(primals: tuple, tangents: tuple) -> tuple:
     return *primals, lax.optimization_barrier(*tangents)
+
+
+def called_jaxpr(eqn: Any) -> ClosedJaxpr | None:
+    """Return the program that an operation of a jaxpr calls once, None where it calls none."""
+    for name in ("jaxpr", "call_jaxpr", "call"):
+        if name in eqn.params and eqn.primitive.name in CALLS:
+            inner = eqn.params[name]
+            return inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ())
+    return None
+
+
+def with_derivative_of(slow: Callable[..., R], fast: Callable[..., R]) -> Callable[..., R]:
+    """Return `fast`, which computes what `slow` does, with the derivative of `slow`."""
+    found = jax.custom_jvp(fast)
+    # The value is that of `fast` here too: under `vmap` within `jit` JAX takes the place of the
+    # batch axis from the function as it stands, and `slow` might put it elsewhere.
+
+    @found.defjvp
+    @own_modes
+    def _(primals: tuple, tangents: tuple) -> tuple[R, R]:
+        return found(*primals), jax.jvp(slow, primals, tangents)[1]
+
+    return found
 
 
 def tree_where(condition: Array, a: T, b: T) -> T:

@@ -25,8 +25,8 @@ from jax.extend.core import Literal, Primitive
 from jax.interpreters import batching, mlir
 
 from jaxmpc.pytrees import record
-from jaxmpc.qp.jax_transformations import has_jax_triton, on_gpu
-from jaxmpc.qp.triton_source import inner_jaxpr, triton_function, triton_source
+from jaxmpc.qp.jax_transformations import called_jaxpr, has_jax_triton, on_gpu
+from jaxmpc.qp.triton_source import triton_function, triton_source
 
 # Least side of a matrix in Triton's products.
 LEAST = 16
@@ -198,10 +198,14 @@ def _hold(result: Array) -> None:
 
 
 def in_one_program(
-    function: Callable, data: list[tuple[Array, float]], lengths: list[int], numbers: int
+    function: Callable,
+    numbers: list[Any],
+    data: list[tuple[Array, float]],
+    lengths: list[int],
+    count: int,
 ) -> tuple[list[Array], list[Array]]:
-    """Return function(*vectors), a list of vectors and a list of so many numbers, all of one type,
-    computed by one program: one launch for a batch, and no intermediate result in memory.
+    """Return function(*numbers, *vectors), a list of vectors and a list of `count` numbers, all of
+    one type, computed by one program: one launch for a batch, and no intermediate result in memory.
 
     data: vectors and what they are filled up with, to a power of two; lengths: those of the vectors
     returned. The function consists of operations entry by entry and reductions.
@@ -209,25 +213,26 @@ def in_one_program(
     dtype = data[0][0].dtype
 
     def in_registers(*refs: Ref) -> None:
-        *in_refs, numbers_ref = refs
+        given_ref, *in_refs, found_ref = refs
         in_refs, out_refs = in_refs[: len(data)], in_refs[len(data) :]
 
-        def read(ref: Ref, count: int, fill: float) -> Array:
-            i = indices(padded_side(count))
-            return load(ref.at[i], i < count, fill)
+        def read(ref: Ref, length: int, fill: float) -> Array:
+            i = indices(padded_side(length))
+            return load(ref.at[i], i < length, fill)
 
-        given = [read(ref, len(v), fill) for ref, (v, fill) in zip(in_refs, data, strict=True)]
-        vectors, found = function(*given)
-        for ref, vector, count in zip(out_refs, vectors, lengths, strict=True):
+        vectors = [read(ref, len(v), fill) for ref, (v, fill) in zip(in_refs, data, strict=True)]
+        vectors, found = function(*map(given_ref.__getitem__, range(len(numbers))), *vectors)
+        for ref, vector, length in zip(out_refs, vectors, lengths, strict=True):
             i = indices(len(vector))
-            store(ref.at[i], vector, i < count)
-        k, together = indices(padded_side(numbers)), jnp.zeros(padded_side(numbers), dtype)
+            store(ref.at[i], vector, i < length)
+        k, together = indices(padded_side(count)), jnp.zeros(padded_side(count), dtype)
         for n, number in enumerate(found):
             together = jnp.where(k == n, number.astype(dtype), together)
-        store(numbers_ref.at[k], together, k < numbers)
+        store(found_ref.at[k], together, k < count)
 
-    shapes = [jax.ShapeDtypeStruct((count,), dtype) for count in [*lengths, numbers]]
-    *vectors, found = call(in_registers, shapes)(*(vector for vector, _ in data))
+    shapes = [jax.ShapeDtypeStruct((length,), dtype) for length in [*lengths, count]]
+    given = jnp.stack(numbers).astype(dtype)
+    *vectors, found = call(in_registers, shapes)(given, *(vector for vector, _ in data))
     return vectors, list(found)
 
 
@@ -434,7 +439,7 @@ def _equation(eqn: Any, given: list, memory: Any) -> tuple[Any, list]:
     if name == "cond":
         branches = [partial(_evaluated, branch) for branch in params["branches"]]
         return lax.switch(given[0], branches, given[1:], memory)
-    inner = inner_jaxpr(eqn)
+    inner = called_jaxpr(eqn)
     if inner is not None:
         return _evaluated(inner, given, memory)
     if name == "dot_general" and (eqn.outvars[0].aval.dtype != jnp.float32 or not on_gpu()):

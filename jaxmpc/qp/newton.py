@@ -39,12 +39,12 @@ from jaxmpc.qp.dual import (
 )
 from jaxmpc.qp.jax_transformations import (
     has_kernels,
-    own_modes,
     repeat_while,
     tree_where,
     varying,
+    with_derivative_of,
 )
-from jaxmpc.qp.kernel import in_one_program, indices
+from jaxmpc.qp.kernel import in_one_program
 from jaxmpc.qp.linalg import infinity_norm, matmul, solve
 from jaxmpc.qp.problem import FREE, Bounds
 from jaxmpc.qp.residuals import (
@@ -168,31 +168,23 @@ def line_minimum(
     given = bounds, jnp.asarray(rho, v.dtype), v, Ad, slope, curvature
     if bounds.balls or not has_kernels(len(v)):
         return _line_minimum(*given)
-    fast = jax.custom_jvp(_line_minimum_in_kernel)
-
-    @fast.defjvp
-    @own_modes
-    def _(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-        return fast(*primals), jax.jvp(_line_minimum, primals, tangents)[1]
-
-    return fast(*given)
+    return with_derivative_of(_line_minimum, _line_minimum_in_kernel)(*given)
 
 
 def _line_minimum_in_kernel(
     bounds: Bounds, rho: Array, v: Array, Ad: Array, slope: Array, curvature: Array
 ) -> Array:
-    def program(three: Array, v: Array, Ad: Array, *columns: Array) -> tuple[list, list[Array]]:
-        i = indices(len(three))
-        slope, curvature, rho = (jnp.sum(jnp.where(i == n, three, 0.0)) for n in range(3))
+    def program(
+        slope: Array, curvature: Array, rho: Array, v: Array, Ad: Array, *columns: Array
+    ) -> tuple[list, list[Array]]:
         bounds = Bounds.of_rows(columns)
         step = _bracket(bounds, rho, v, Ad, slope, curvature)
         again, end = lambda _, carry: step(carry), jnp.int32(_line_steps(bounds))
         carry = lax.fori_loop(jnp.int32(0), end, again, _first_bracket(slope))
         return [], [_end_of(carry)]
 
-    three = jnp.stack([slope, curvature, rho])
     rows = [(v, 0.0), (Ad, 0.0), *zip(bounds.columns, FREE, strict=False)]
-    return in_one_program(program, [(three, 0.0), *rows], [], 1)[1][0]
+    return in_one_program(program, [slope, curvature, rho], rows, [], 1)[1][0]
 
 
 # A step length t, and those that are known to be too small and too large.

@@ -11,7 +11,9 @@ import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Literal
+from jax.extend.core import Literal
+
+from jaxmpc.qp.jax_transformations import called_jaxpr
 
 if TYPE_CHECKING:
     from jaxmpc.qp.kernel import Kernel
@@ -107,15 +109,6 @@ def triton_function(source: str) -> Any:
     return space[name]
 
 
-def inner_jaxpr(eqn: Any) -> Any:
-    """Return the closed jaxpr that an equation calls, or None."""
-    for name in ("jaxpr", "call_jaxpr"):
-        inner = eqn.params.get(name)
-        if isinstance(inner, ClosedJaxpr):
-            return inner
-    return None
-
-
 class _Lines:
     """Lines of a function as they are written, and the names of variables."""
 
@@ -162,7 +155,7 @@ class _Lines:
         if kind == "barrier":
             self.add("tl.debug_barrier()")
             return ["0"]
-        inner = inner_jaxpr(eqn)
+        inner = called_jaxpr(eqn)
         if inner is not None:
             return self.jaxpr(inner, given)
         return [self.new(self.text(eqn, given))]

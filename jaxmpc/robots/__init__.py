@@ -11,7 +11,7 @@ Film                  the same for a notebook, which plays it
 
 from jaxmpc.robots import tasks
 from jaxmpc.robots.film import Film, render, save_video
-from jaxmpc.robots.linear_enclosure import linear_enclosure
+from jaxmpc.robots.linear_enclosures import linear_enclosure
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.load import load_robot
 from jaxmpc.robots.robot import RobotModel

@@ -13,6 +13,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
 
 from jaxmpc.checks import fail
+from jaxmpc.qp.jax_transformations import called_jaxpr
 from jaxmpc.robots.intervals import (
     Interval,
     add,
@@ -223,25 +224,25 @@ class TaylorProgram:
         read = lambda v: np.asarray(v.val) if isinstance(v, Literal) else values[v]
         for number, eqn in enumerate(jaxpr.eqns):
             here, given = (*place, number), [read(v) for v in eqn.invars]
-            if any(isinstance(v, Taylor) for v in given):
-                made = self._moving(jaxpr, eqn, given, here)
-            elif here in self.known:
+            moving, inner = any(isinstance(v, Taylor) for v in given), called_jaxpr(eqn)
+            if here in self.known and not moving:
                 made = self.known[here]
+            elif inner is not None:
+                made = self._evaluated(inner, given, here)
+            elif eqn.primitive.name in ALIKE:
+                made = given
+            elif moving:
+                made = self._moving(jaxpr, eqn, given, here)
             else:
-                made = self.known[here] = self._still(jaxpr, eqn, given, here)
+                made = self._still(jaxpr, eqn, given)
+            if not moving:
+                self.known[here] = made
             values.update(zip(eqn.outvars, made, strict=True))
         return [read(v) for v in jaxpr.outvars]
 
-    def _still(
-        self, jaxpr: Jaxpr, eqn: Any, given: Sequence[np.ndarray], place: tuple[int, ...]
-    ) -> list:
+    def _still(self, jaxpr: Jaxpr, eqn: Any, given: Sequence[np.ndarray]) -> list:
         """Return what an operation on constants returns."""
-        inner = _inner(eqn)
-        if inner is not None:
-            return self._evaluated(inner, given, place)
         name = eqn.primitive.name
-        if name in ALIKE:
-            return list(given)
         if name in SHAPES:
             return [SHAPES[name](given[0], 0, **eqn.params)]
         if name in ON_CONSTANTS:
@@ -250,12 +251,7 @@ class TaylorProgram:
 
     def _moving(self, jaxpr: Jaxpr, eqn: Any, given: Sequence, place: tuple[int, ...]) -> list:
         """Return what an operation on functions returns."""
-        inner = _inner(eqn)
-        if inner is not None:
-            return self._evaluated(inner, given, place)
         name = eqn.primitive.name
-        if name in ALIKE:
-            return list(given)
         if name in SHAPES:
             return [given[0].mapped(lambda ends: SHAPES[name](ends, 2, **eqn.params))]
         if name in RULES:
@@ -297,15 +293,6 @@ class TaylorProgram:
         ]
 
 
-def _inner(eqn: Any) -> ClosedJaxpr | None:
-    """Return the program that an operation calls, None where it calls none."""
-    for name in ("jaxpr", "call_jaxpr", "call"):
-        if name in eqn.params and eqn.primitive.name in CALLS:
-            inner = eqn.params[name]
-            return inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ())
-    return None
-
-
 def _alone(jaxpr: Jaxpr, eqn: Any, given: Sequence) -> list[np.ndarray]:
     """Return what one operation returns for these operands."""
     free = {v: x for v, x in zip(eqn.invars, given, strict=True) if not isinstance(v, Literal)}
@@ -314,8 +301,7 @@ def _alone(jaxpr: Jaxpr, eqn: Any, given: Sequence) -> list[np.ndarray]:
         return [np.asarray(v) for v in jaxpr_as_fun(ClosedJaxpr(one, ()))(*free.values())]
 
 
-# Operations that call a program, and those that return their operands.
-CALLS = {"jit", "pjit", "closed_call", "custom_jvp_call", "custom_vmap_call", "remat"}
+# Operations that return their operands.
 ALIKE = {"optimization_barrier", "copy", "copy_p", "stop_gradient", "device_put", "reshard"}
 
 

@@ -240,9 +240,9 @@ def call_damped():
 
 
 def call_in_registers():
-    least = lambda x, y: ([jnp.minimum(x, y)], [jnp.max(x * y), jnp.sum(x)])
+    least = lambda a, b, x, y: ([jnp.minimum(a * x, y)], [jnp.max(x * y), jnp.sum(x) + b])
     x, y = random_of(jnp.float64)(6)
-    kernel.in_one_program(least, [(x, 0.0), (y, 1.0)], [6], 2)
+    kernel.in_one_program(least, [x[0], y[1]], [(x, 0.0), (y, 1.0)], [6], 2)
 
 
 def call_line_search(soft):

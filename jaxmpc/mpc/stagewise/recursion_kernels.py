@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxmpc.qp.jax_transformations import on_gpu, own_modes
+from jaxmpc.qp.jax_transformations import on_gpu, with_derivative_of
 from jaxmpc.qp.kernel import EXACT, barrier, call, dot, indices, load, padded_side, store
 from jaxmpc.qp.linalg import WAITS, batched, inverse_root_side_by_side, matmul, solve
 
@@ -108,16 +108,7 @@ def _or_kernel(scan: Callable, kernel: Callable, *args: Array, lanes: Any = None
         if lanes is None or WAITS:  # the fusions of those versions of XLA compute products again
             return scan(*args)
         kernel = batched(lambda *args: scan(*args), lanes, MOST)
-    fast = jax.custom_jvp(kernel)
-    # The value is the kernel's here too: under `vmap` within `jit` JAX takes the place of the batch
-    # axis from the function as it stands, and a scan would put it elsewhere.
-
-    @fast.defjvp
-    @own_modes
-    def _(primals: tuple, tangents: tuple) -> tuple:
-        return fast(*primals), jax.jvp(scan, primals, tangents)[1]
-
-    return fast(*args)
+    return with_derivative_of(scan, kernel)(*args)
 
 
 def _scan(M: Array, w: Array, start: Array, *, adjoint: bool, unroll: int = 1) -> Array:
