@@ -26,11 +26,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxmpc.verify.exact import integers, inverse_of, ratio
+from jaxmpc.verify.exact import UNIT_ROUNDOFF, integers, inverse_of, ratio
 from jaxmpc.verify.stored_policy import directions, fractions, taken_by_section
 from jaxmpc.verify.stored_problem import Constraints, bits, nominal
-
-UNIT_ROUNDOFF = 2.0**-53
 
 
 class Dyadic(NamedTuple):
