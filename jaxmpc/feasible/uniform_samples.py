@@ -46,8 +46,6 @@ from jaxmpc.pytrees import record
 from jaxmpc.qp.admm import ADMM, DEFAULT
 from jaxmpc.sets.convex_sets import Polytope
 
-# Entries of a normal that are rounding, beside its largest: points are proved whatever they are.
-ROUNDING = 1e-12
 # Chains side by side, and points of a trial that looks for facets.
 CHAINS, TRIAL = 4096, 512
 # Steps between two points of a chain that are kept, for each coordinate. A step takes 1/d of what a
@@ -292,9 +290,6 @@ class Bounds(NamedTuple):
         valid = np.isfinite(found.offsets)
         normals = np.concatenate([self.normals, found.normals[valid]])
         offsets = np.concatenate([self.offsets, found.offsets[valid]])
-        # Entries that are rounding would spoil the scaling of programs over them.
-        size = np.abs(normals).max(axis=1, keepdims=True)
-        normals = np.where(np.abs(normals) < ROUNDING * size, 0.0, normals)
         try:
             body = Polytope(normals, offsets).reduce()
         except ValueError:  # too ill-conditioned: more than are needed

@@ -327,16 +327,17 @@ def scaling(G: np.ndarray, g: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
     column_j is how far along x_j the rows that it dominates let a point go, |g_i| / |G_ij|, in the
     median. A row is dominated by the entries within a factor of 16 of its largest in scaled
-    columns. So entries of G that are rounding have no influence, nor have distances 1e12 times
-    smaller or larger than most, which are rounding or no limits. This starts from the least squares
-    fit of the logarithms of [G, g] (Curtis & Reid 1972, J. Inst. Maths Applics 10). Rows follow:
-    their largest entry is about 1. A change of units of rows and columns changes the answer by the
-    same factors.
+    columns. So entries of G that are rounding have no influence (`_rounding_entries`), nor have
+    distances 1e12 times smaller or larger than most, which are rounding or no limits. This starts
+    from the least squares fit of the logarithms of [G, g] (Curtis & Reid 1972, J. Inst. Maths
+    Applics 10). Rows follow: their largest entry is about 1. A change of units of rows and columns
+    changes the answer by the same factors.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
-        L, distance = np.log2(np.abs(G)), np.log2(np.abs(g))
-        reach = np.where(np.isfinite(L), distance[:, None] - L, np.inf)
-    reach[~np.isfinite(distance)] = np.inf
+        every, distance = np.log2(np.abs(G)), np.log2(np.abs(g))
+        reach = np.where(np.isfinite(every), distance[:, None] - every, np.inf)
+        reach[~np.isfinite(distance)] = np.inf
+        L = np.where(_rounding_entries(every, distance, reach), -np.inf, every)
     both = np.column_stack([L, distance])
     there = np.isfinite(both)
     both = np.where(there, both, 0.0)
@@ -362,10 +363,26 @@ def scaling(G: np.ndarray, g: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         middle = np.sort(np.where(ruled, reach, np.inf), axis=0)[np.maximum(count - 1, 0) // 2]
         column = np.where(count > 0, np.diagonal(middle), column)
     column = np.round(column)
-    T = L + column
-    top = T.max(axis=1, initial=-np.inf)
+    top = (every + column).max(axis=1, initial=-np.inf)
     top = np.where(np.isfinite(top), top, np.where(np.isfinite(distance), distance, 0.0))
     return np.exp2(-np.round(top)), np.exp2(column)
+
+
+def _rounding_entries(L: np.ndarray, distance: np.ndarray, reach: np.ndarray) -> np.ndarray:
+    """Return which entries of G are rounding; L and distance are the logarithms of [G, g].
+
+    They are 1e10 times smaller than the largest of their row where each x_j is in units of how far
+    along it the nearest row lets a point go. Then either the entry or the distance of that row is
+    rounding: that which is smaller beside the largest entry of its row. In many rows such entries
+    would pass for another unit of their column.
+    """
+    nearest, top = reach.min(axis=0, initial=np.inf), L.max(axis=1, initial=-np.inf)
+    known = np.isfinite(nearest)
+    if not known.any():
+        return np.zeros(L.shape, bool)
+    scaled = np.where(known, L + nearest, -np.inf)
+    small = scaled - scaled.max(axis=1, keepdims=True) < -33
+    return known & small & (L - top[:, None] < (distance - top)[reach.argmin(axis=0)])
 
 
 def maximise(d: np.ndarray, G: np.ndarray, g: np.ndarray) -> Optimum:

@@ -1,5 +1,7 @@
 """Units of rows and coordinates change no answer of a set: the same random set is written in other
-units, x = unit x', and with every row times another number."""
+units, x = unit x', and with every row times another number. Nor does rounding in the rows."""
+
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -112,6 +114,65 @@ def test_projection_of_a_flat_set_is_that_of_its_other_description():
     same_points(flat.project([0, 2]).vertices(), corners)
     line = flat.intersect(jm.Polytope([[1, 0, 0], [-1, 0, 0]], [0, 0])).project([1, 2])
     same_points(line.vertices(), np.array([[-1, 2.7], [1, -1.3]]))
+
+
+def polygon(rng, rows):
+    """Rows y'x <= 1 about the origin, and the exact area of what they leave of a square."""
+    angle = rng.uniform(0, 2 * np.pi, rows)
+    G = np.vstack([np.column_stack([np.cos(angle), np.sin(angle)]), np.eye(2), -np.eye(2)])
+    g = np.append(rng.uniform(0.5, 2, rows), np.full(4, 2.0))
+    corners = [[Fraction(x), Fraction(y)] for x, y in ((-2, -2), (2, -2), (2, 2), (-2, 2))]
+    for row, end in zip(G, g, strict=True):
+        (a, b), end = map(Fraction, row), Fraction(end)
+        room = [end - a * x - b * y for x, y in corners]
+        kept = []
+        for i, (p, r) in enumerate(zip(corners, room, strict=True)):
+            q, s = corners[i - 1], room[i - 1]
+            if (r > 0) != (s > 0):
+                kept.append([v + (w - v) * s / (s - r) for v, w in zip(q, p, strict=True)])
+            if r >= 0:
+                kept.append(p)
+        corners = kept
+    turned = zip(corners, corners[1:] + corners[:1], strict=True)
+    return G, g, sum(p[0] * q[1] - p[1] * q[0] for p, q in turned) / 2
+
+
+def check_rounding(seed):
+    """A product of polygons, most rows of which belong to one of them, with rounding in place of
+    zeros: its volume is the exact one, it has no equalities, and its centre keeps all rows."""
+    rng = np.random.default_rng(seed)
+    n = 2 * int(rng.integers(2, 5))
+    parts = [polygon(rng, 1 if i else 60) for i in range(n // 2)]
+    H = np.zeros((sum(len(g) for _, g, _ in parts), n))
+    h, start, volume = np.concatenate([g for _, g, _ in parts]), 0, Fraction(1)
+    for i, (G, g, area) in enumerate(parts):
+        H[start : start + len(g), 2 * i : 2 * i + 2] = G
+        start, volume = start + len(g), volume * area
+    size = 10.0 ** rng.uniform(-17, -13, H.shape) * rng.choice([-1, 0, 1], H.shape)
+    noisy = np.where(H == 0, size, H)
+    unit = 10.0 ** rng.uniform(-3, 3, n) if seed % 2 else np.ones(n)
+    P = jm.Polytope(noisy * unit, h)
+    assert P.volume() * np.prod(unit) == pytest.approx(float(volume), rel=1e-9)
+    reduced, clean = P.reduce(), jm.Polytope(H * unit, h).reduce()
+    assert P.affine_dimension() == n and len(reduced.h) == len(clean.h)
+    d = rng.normal(size=n) * unit
+    assert P.support(d) == pytest.approx(clean.support(d), rel=1e-9)
+    center, _ = P.chebyshev()
+    center = [Fraction(x) for x in center]
+    for row, end in zip(*P.half_spaces(), strict=True):
+        assert sum(Fraction(a) * x for a, x in zip(row, center, strict=True)) < Fraction(end)
+
+
+@pytest.mark.parametrize("seed", range(6, 12))
+def test_rounding_in_rows_changes_no_answer(seed):
+    check_rounding(seed)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_rounding_in_rows_changes_no_answer_many():
+    for seed in range(12, 106):
+        check_rounding(seed)
 
 
 def plant(rng):
