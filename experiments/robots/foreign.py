@@ -126,7 +126,7 @@ FURTHER: dict[tuple[str, str], dict[str, dict[str, bool]]] = {
         "icub_description/robots/icub": MEND,
     },
     ("robosuite", "models/assets/robots"): {
-        f"{name}/robot": {}
+        f"{name}/robot": {"contacts": False}
         for name in ("panda", "iiwa", "kinova3", "jaco", "sawyer", "ur5e", "xarm7", "baxter",
                      "gr1", "spot", "spot_arm", "tiago")
     },
@@ -134,7 +134,7 @@ FURTHER: dict[tuple[str, str], dict[str, dict[str, bool]]] = {
         "arms/ur3e/ur3e": {},
         "arms/ur5e/ur5e": {},
         "grippers/robotiq_2f_85/urdf/robotiq_2f_85": {},
-        "grippers/schunk_egk40/urdf/schunk_egk40": {},
+        "grippers/schunk_egk40/urdf/schunk_egk40": MEND,
     },
     ("armar", "description/urdf"): {"armar6": MEND, "armar4": MEND},
     ("dexmate_urdf", "robots"): {

@@ -7,10 +7,13 @@ that MuJoCo enforces by stiff springs (solref, solimp). Here they are exact, by 
 
 import numpy as np
 
-from jaxmpc.robots.mujoco_access import equalities, mujoco
+from jaxmpc.checks import fail
+from jaxmpc.robots.mujoco_access import equalities, mujoco, name_of
 
 # Steps of Newton's method, and the residual (rad, m) at which they end.
-_STEPS, _MET = 50, 1e-12
+_STEPS, _END = 50, 1e-12
+# The residual up to which a coupling counts as met.
+_MET = 1e-6
 # Directions of G smaller than this, relative to the largest, repeat others.
 _RANK = 1e-9
 
@@ -35,23 +38,35 @@ class Couplings:
 
     def met(self, q: np.ndarray) -> np.ndarray:
         """Return the configuration near q that meets the couplings, by Newton's method; where that
-        finds none, where it ends."""
+        finds none, where it ends: see `unmet`."""
         q = np.array(q, float)
         for _ in range(_STEPS if self.there else 0):
             residual, G = self.rows(q)
-            if np.abs(residual).max(initial=0.0) <= _MET:
+            if np.abs(residual).max(initial=0.0) <= _END:
                 break
             step = -np.linalg.lstsq(G, residual, rcond=_RANK)[0]
             mujoco.mj_integratePos(self.model, q, step, 1.0)
         return q
 
+    def unmet(self, q: np.ndarray) -> str:
+        """Return in words which coupling is off the most at q, "" where all are met."""
+        residual = np.abs(self.rows(q)[0]) if self.there else np.zeros(0)
+        if residual.max(initial=0.0) <= _MET:
+            return ""
+        worst = int(np.argmax(residual))
+        number = self.data.efc_id[worst]
+        return f"{name_of(self.model, 'equality', number)} is off by {residual[worst]:.3g}"
+
     def kept(self, states: np.ndarray) -> np.ndarray:
         """Return states (..., nq + nv + na) with the nearest configurations and velocities that
-        keep the couplings."""
+        keep the couplings. Raises ValueError where none is found."""
         states = np.array(states, float)
         nq, nv = self.model.nq, self.model.nv
         for state in states.reshape(-1, states.shape[-1]) if self.there else ():
             state[:nq] = self.met(state[:nq])
+            if off := self.unmet(state[:nq]):
+                cure = "Draw states nearer to home (spread), or mend the couplings of the file"
+                fail("robot", f"its couplings cannot be met near {state[:nq]}: {off}", cure)
             velocity = slice(nq, nq + nv)
             state[velocity] = self.motions(state[:nq]) @ state[velocity]
         return states

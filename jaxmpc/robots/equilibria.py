@@ -30,6 +30,8 @@ _WEIGHTS = (1e-2, 1e-4, 1e-6, 1e-9, 1e-12)
 _STEP = 1e-6
 # Steps of Newton's method for the springs of couplings, and accelerations at which it ends.
 _SETTLING, _SETTLED = 10, 1e-9
+# Configurations tried, further and further inside the limits, where couplings yield beyond them.
+_TRIES = 10
 
 
 @record
@@ -300,7 +302,16 @@ def settled(robot: RobotDescription) -> tuple[Rest, list[str]]:
     if beyond:
         texts.append(f"home lies beyond the limits of {', '.join(beyond)}, and is moved to them")
         q[at] = inside
-    rest, moved = rest_at(robot, q), list[str]()
+    couplings = Couplings(robot.predictor.model)
+    if off := couplings.unmet(couplings.met(q)):
+        texts.append(f"couplings of the file cannot all be met near home: {off}")
+    (rest, yielding), moved = _inside(robot, q), list[str]()
+    if yielding:
+        far, those = np.abs(rest.q - q).max(), ", ".join(yielding)
+        texts.append(
+            f"couplings yield under their load, which would carry {those} beyond the limits; "
+            f"home is moved inside, by up to {far:.2g} rad or m"
+        )
     if rest.held:
         moved = require_rest("home", robot, [rest], touching=True)
     elif hasattr(robot.predictor, "feet"):
@@ -320,6 +331,28 @@ def settled(robot: RobotDescription) -> tuple[Rest, list[str]]:
             "the model is taken at home, where it does not rest"
         )
     return rest, [*(f"robot {robot.name}: {text}" for text in texts), *moved]
+
+
+def _inside(robot: RobotDescription, q: np.ndarray) -> tuple[Rest, list[str]]:
+    """Return the rest at q (nq,), which lies inside the limits, and the names of the positions that
+    couplings carry beyond them there: then the rest is that of a configuration further inside."""
+    single = single_joints(robot.mujoco)
+    at, dof = robot.mujoco.jnt_qposadr[single], robot.mujoco.jnt_dofadr[single]
+    low, high = (end[dof] for end in robot.state_limits.bounds())
+    rest, yielding = rest_at(robot, q), list[str]()
+    for _ in range(_TRIES):
+        back = np.clip(rest.q[at], low, high) - rest.q[at]
+        if not rest.held or not np.any(back):
+            break
+        over = dof[back != 0]
+        yielding = yielding or [robot.state_names[i] for i in over]
+        # The least motion that keeps the couplings and takes these back, half as far again.
+        free = Couplings(robot.predictor.model).motions(q)
+        part = np.linalg.lstsq(free[np.ix_(over, over)], 1.5 * back[back != 0], rcond=1e-9)[0]
+        q = q.copy()
+        mujoco.mj_integratePos(robot.mujoco, q, free[:, over] @ part, 1.0)
+        rest = rest_at(robot, q)
+    return rest, yielding
 
 
 def lacking(robot: RobotDescription, rest: Rest) -> str:

@@ -15,7 +15,7 @@ import numpy as np
 from jaxmpc.arrays import Reals
 from jaxmpc.checks import fail, require_finite, require_package, require_printable, require_shape
 from jaxmpc.robots.configurations import blocks, unit_orientations
-from jaxmpc.robots.mjx_gaps import compared, lacks, translate
+from jaxmpc.robots.mjx_gaps import compared, lacks, mesh_contacts, translate
 from jaxmpc.robots.mujoco_access import (
     BALL,
     FREE,
@@ -37,6 +37,8 @@ from jaxmpc.sets.limits import Limit, limit_pair
 from jaxmpc.systems.system import require_period
 
 MODELS = ("joint", "pendulum", "cartpole", "arm2", "arm6", "arm7", "quadrotor")
+# Pairs of meshes in contact that compile within some twenty seconds.
+_MESHES = 4
 
 
 def load_robot(
@@ -51,6 +53,7 @@ def load_robot(
     floating_base: bool = False,
     mend_inertias: bool = False,
     motors: bool = False,
+    contacts: bool = True,
 ) -> Robot:
     """Load a robot: a model of ours, an MJCF or URDF file, or a mujoco.MjModel.
 
@@ -74,6 +77,8 @@ def load_robot(
             which `report` lists. Without it they are refused.
         motors: of an MJCF file without actuators, whether each hinge and slide joint that follows
             no other gets a motor of gear 1, with the joint's `actuatorfrcrange` as limit.
+        contacts: False leaves all contacts out of the plant. MJX needs minutes to compile those
+            between meshes, which an arm that touches nothing has for nothing.
 
     Defaults where the file lacks `<numeric name="velocity_limit">`, `<numeric name=
     "control_period">` and `<key name="home">`: none, 10 ms (rounded to physics steps), and the
@@ -100,6 +105,8 @@ def load_robot(
     host, name = file.model, file.name
     _require_plant(host, name)
     substeps, period = _periods(host, control_period, timestep)
+    if not contacts:
+        host.opt.disableflags |= flag("contact")
     given = copy.deepcopy(host)
     host.opt.disableflags |= flag("clampctrl")
     cleared = translate(host)
@@ -120,11 +127,12 @@ def load_robot(
     states, sources = state_limits(host, position, velocity, file.velocities)
     q, act, origin = _home(host, home)
     start, plant = np.concatenate([q, np.zeros(host.nv), act]), Physics(host)
+    _warn_of_meshes(name, host)
     idle, without, unlike = compared(given, plant, missing, inputs, start)
     _warn_of_differences(name, host, without, unlike, file.lost)
     notes = {
         "cleared": [*cleared, *(f"{text}, without effect" for text in idle)],
-        "left out": [*file.lost, *without, *unlike],
+        "left out": [*["all contacts"] * (not contacts), *file.lost, *without, *unlike],
         "mended": file.mended,
         "home": [origin],
         "limit": [*sources, *input_sources],
@@ -192,7 +200,7 @@ def _opened(
             host, lost = compiled_mjcf(path, motors)
             return _File(host, path.stem, {}, (), False, lost)
         welded = not floating_base
-        root = ElementTree.fromstring(path.read_text())
+        root = parsed_urdf(path.read_text())
         drawn = drawable(root, path.resolve().parent)
         host, velocities, mended = compiled_urdf(root, floating_base, mend_inertias)
         if floating_base:
@@ -262,6 +270,17 @@ def _warn_of_differences(
         texts.append(f"moves otherwise than its file says: {'; '.join(unlike)}")
     if texts:
         warnings.warn(f"robot {name} {', and '.join(texts)}", stacklevel=3)
+
+
+def _warn_of_meshes(name: str, host: "mujoco.MjModel") -> None:
+    """Warn of many contacts between meshes before they are compiled."""
+    count = mesh_contacts(host)
+    if count > _MESHES:
+        warnings.warn(
+            f"robot {name} has {count} pairs of meshes that can touch; MJX compiles each for some "
+            "seconds. Where they need not touch, load it with contacts=False",
+            stacklevel=3,
+        )
 
 
 def _compare_versions() -> None:
@@ -560,6 +579,16 @@ def compiled_urdf(
         raise
 
 
+def parsed_urdf(text: str) -> ElementTree.Element:
+    """Return the root of a URDF. Prefixes of other programs (drake:acceleration) that the file does
+    not declare, as most readers of URDF allow, are declared here."""
+    used = set(re.findall(r"[\s</]([A-Za-z_][\w.-]*):[A-Za-z_]", text))
+    declared = set(re.findall(r"xmlns:([\w.-]+)\s*=", text))
+    missing = sorted(used - declared - {"xml", "xmlns"})
+    attributes = "".join(f' xmlns:{prefix}="{prefix}"' for prefix in missing)
+    return ElementTree.fromstring(re.sub(r"<robot\b", f"<robot{attributes}", text))
+
+
 def _root_link(root: ElementTree.Element) -> str:
     """Return the name of the link that is no joint's child."""
     children = {child.get("link") for child in root.findall("joint/child")}
@@ -627,7 +656,8 @@ def _mended(root: ElementTree.Element) -> tuple[str, ...]:
         ball = max(_ball(mass), 1e-12)
         given, axes = np.linalg.eigh(_inertia(inertial))
         if not np.any(given) and link.get("name") not in moving:
-            continue  # a point mass, which MuJoCo takes
+            _write(inertial, mass, np.zeros((3, 3)))  # a point mass, which MuJoCo takes
+            continue
         moments = np.where(given > 1e-6 * ball, given, ball)
         order = np.argsort(moments)
         a, b, c = moments[order]

@@ -188,6 +188,15 @@ def _possible_contacts(model: "mujoco.MjModel") -> list[tuple[int, int, int]]:
     return [(int(a), int(b), int(pair)) for a, b, pair in collision_driver.geom_pairs(model)]
 
 
+def mesh_contacts(model: "mujoco.MjModel") -> int:
+    """Return how many pairs of meshes can touch."""
+    if not acts(model, "contact"):
+        return 0
+    pairs = [contact[:2] for contact in _possible_contacts(model)]
+    meshes = model.geom_type == mujoco.mjtGeom.mjGEOM_MESH
+    return sum(bool(np.all(meshes[list(pair)])) for pair in pairs)
+
+
 def _dimension(model: "mujoco.MjModel", first: int, second: int, pair: int) -> int:
     """Return condim of a contact: of the pair, of the geom of higher priority, or the larger."""
     if pair >= 0:

@@ -184,12 +184,13 @@ class Robot(RobotDescription):
     def _require_coupled(self, q: np.ndarray) -> None:
         """Raise ValueError where configurations (..., nq) violate couplings of the file."""
         couplings = Couplings(self.predictor.model)
-        for row in q.reshape(-1, q.shape[-1]) if couplings.there else ():
-            beyond = np.abs(couplings.rows(row)[0]).max()
-            if beyond > 1e-6:
+        for row in q.reshape(-1, q.shape[-1]):
+            if off := couplings.unmet(row):
                 nearest = couplings.met(row)
-                problem = f"{row} violates couplings (equalities) of the file by {beyond:.3g}"
-                fail("q", problem, f"The nearest configuration that meets them: {nearest}")
+                cure = f"The nearest configuration that meets them: {nearest}"
+                if couplings.unmet(nearest):
+                    cure = "No configuration near it meets them: start elsewhere, or mend the file"
+                fail("q", f"{row} violates couplings (equalities) of the file: {off}", cure)
 
     def set_point(self, target: Any = None) -> tuple[np.ndarray, np.ndarray]:
         """Return (x, u), the state and the input about which `robot_mpc` takes its model.

@@ -35,6 +35,33 @@ def coupled(kind):
     return jm.load_robot(mujoco.MjModel.from_xml_string(text))
 
 
+def test_a_set_point_lies_inside_the_limits_though_couplings_yield():
+    """The third link is at the end of its range at home, and its weight pulls it beyond: a stop
+    that pushes there would be no rest."""
+    text = MODEL.format(link=LINK, equality=COUPLINGS["joint"])
+    text = text.replace('name="l" axis="0 1 0" damping=".5" range="-90 90"',
+                        'name="l" axis="0 1 0" damping=".5" range="-90 0"')  # fmt: skip
+    robot = jm.load_robot(mujoco.MjModel.from_xml_string(text))
+    with pytest.warns(UserWarning, match="couplings yield .* would carry l beyond the limits"):
+        x, u = robot.set_point()
+    assert -0.05 < x[0] < 0 and -0.01 < x[2] <= 0
+    data = mujoco.MjData(robot.file)
+    data.qpos[:], data.ctrl[:] = x[:3], u
+    mujoco.mj_forward(robot.file, data)
+    assert data.nefc == 1 and np.abs(data.qacc).max() < 1e-6  # the coupling alone: no stop
+
+
+def test_couplings_that_contradict_one_another_are_named():
+    """l = j / 2 and l = 1 + j / 2: half of the difference is left wherever one looks."""
+    pair = [f'<joint joint1="l" joint2="j" name="{c}" polycoef="{c} .5 0 0 0"/>' for c in (0, 1)]
+    text = MODEL.format(link=LINK, equality="".join(pair))
+    couplings = Couplings(mujoco.MjModel.from_xml_string(text))
+    assert "equality 1 is off by 1" in couplings.unmet(np.zeros(3))
+    assert "is off by 0.5" in couplings.unmet(couplings.met(np.zeros(3)))
+    with pytest.raises(ValueError, match="cannot be met near .* is off by 0.5"):
+        couplings.kept(np.zeros((1, 6)))
+
+
 # (MJX has no force for the turning of connect and weld, which loading says.)
 @pytest.mark.filterwarnings("ignore:.*pushes otherwise")
 @pytest.mark.parametrize("kind", ["joint", *(slow(k) for k in ("tendon", "connect", "weld"))])
@@ -89,7 +116,7 @@ def test_random_starts_meet_the_couplings():
 
 def test_a_target_off_the_couplings_is_refused_and_its_cure_helps():
     robot = coupled("joint")
-    with pytest.raises(ValueError, match="q: .* violates couplings .* by 0.2") as refusal:
+    with pytest.raises(ValueError, match="q: .* violates couplings .* off by 0.2") as refusal:
         robot.equilibrium([0.0, 0.0, 0.2])
     cure = np.fromstring(str(refusal.value).split("[")[-1].strip("]. "), sep=" ")
     x, _ = robot.equilibrium(Couplings(robot.predictor.model).met(cure))

@@ -8,6 +8,7 @@ import pytest
 
 import jaxmpc as jm
 from jaxmpc.robots.film import _camera
+from jaxmpc.robots.load import _warn_of_meshes
 
 URDF = """<?xml version="1.0"?>
 <!-- <mujoco> in a comment -->
@@ -18,12 +19,35 @@ URDF = """<?xml version="1.0"?>
 <limit lower="-1" upper="1" effort="5" velocity="2"/></joint></robot>"""
 
 
+PLATE = """<link name="plate"><inertial><mass value=".1"/></inertial></link>
+<joint name="mount" type="fixed"><parent link="rod"/><child link="plate"/></joint></robot>"""
+
+
 def test_a_urdf_of_any_name(tmp_path):
+    """With attributes of other programs whose prefix the file does not declare."""
     path = Path(tmp_path / "swing_urdf.xml")
-    path.write_text(URDF)
+    path.write_text(URDF.replace("<limit ", '<limit drake:acceleration="2" '))
     robot = jm.load_robot(path)
     np.testing.assert_array_equal(robot.input_limits.upper, [5])
-    assert jm.load_robot(path, floating_base=True, mend_inertias=True).n == 14
+    path.write_text(URDF.replace("</robot>", PLATE))  # a point mass without an inertia
+    robot = jm.load_robot(path, floating_base=True, mend_inertias=True)
+    assert robot.n == 14
+    np.testing.assert_allclose(robot.mujoco.body_mass.sum(), 1.1, rtol=1e-3)
+
+
+def test_contacts_are_left_out_on_request(tmp_path):
+    """And where many meshes could touch, a warning names that."""
+    corners = "0 0 0  .1 0 0  0 .1 0  0 0 .1"
+    body = '<body pos="0 0 {}"><joint type="slide"/><geom type="mesh" mesh="m"/></body>'
+    text = f'''<mujoco><asset><mesh name="m" vertex="{corners}"/></asset><worldbody>
+    {"".join(body.format(i) for i in range(4))}</worldbody><actuator><motor site="s"/></actuator>
+    </mujoco>'''.replace("</worldbody>", '<site name="s"/></worldbody>')
+    path = Path(tmp_path / "four.xml")
+    path.write_text(text)
+    robot = jm.load_robot(path, contacts=False)
+    assert robot.report().left_out == ("all contacts",) and not robot.plant.rows
+    with pytest.warns(UserWarning, match="four has 6 pairs of meshes .* load it with contacts=Fal"):
+        _warn_of_meshes("four", mujoco.MjModel.from_xml_path(str(path)))
 
 
 @pytest.mark.parametrize("size", [0, 0.1, 3])
