@@ -399,7 +399,7 @@ def stated_terms(controller: Controller, y: Array, x: Array, u: Array, aim: Aim)
         gu = gu + _of_rates(push)
     gx, gu = 2 * gx, 2 * gu
 
-    violations, values, limits = [], [], []
+    violations, values, limits, slopes = [], [], [], []
     gap = products = jnp.zeros((), x.dtype)
     for block, y_block in zip(blocks(mpc, x.dtype), split(c.layout, y), strict=True):
         if block.rate:
@@ -416,6 +416,7 @@ def stated_terms(controller: Controller, y: Array, x: Array, u: Array, aim: Aim)
         violations.append(bounds.violation(v))
         values.append(jnp.abs(v))
         limits.append(bounds.sizes())
+        slopes.append(bounds.slope(v))
 
     moved = jnp.concatenate([M.reshape(-1, M.shape[-1]) for M in (c.Gamma, c.Omega)])
     g = matmul(jnp.concatenate([gx.ravel(), gu.ravel()]), moved)
@@ -428,10 +429,13 @@ def stated_terms(controller: Controller, y: Array, x: Array, u: Array, aim: Aim)
     terms = dynamics_terms(A, B, drift, x, u)
     most = jnp.max(jnp.abs(x), axis=0) + SHARE * jnp.max(terms, axis=0)
     most = jnp.broadcast_to(most, terms.shape)
-    value, limit = (jnp.concatenate([*parts, y[:0]]) for parts in (values, limits))
+    value, limit, slope = (jnp.concatenate([*v, y[:0]]) for v in (values, limits, slopes))
     row_size = jnp.maximum(limit, value)
     # Only a limit of 0 has no size of its own.
     unknown = jnp.where(limit > 0, 0.0, factor.row_norms)
+    row_terms = row_size + rounds * unknown
+    # A penalty is a multiple of a violation, which is a difference of the terms of its row.
+    products = products + jnp.sum(slope * row_terms)
     per_variable = 1 / jnp.sum(jnp.abs(factor.T), axis=1)
     # At a set-point tracking errors are zero, but not their rounding, which adds up over the steps
     # whose terms cancel, as where inputs balance the weight.
@@ -443,7 +447,7 @@ def stated_terms(controller: Controller, y: Array, x: Array, u: Array, aim: Aim)
         (
             jnp.concatenate([*violations, defects.ravel()]),
             jnp.concatenate([row_size + SHARE * length * unknown, most.ravel()]),
-            jnp.concatenate([row_size + rounds * unknown, terms.ravel()]),
+            jnp.concatenate([row_terms, terms.ravel()]),
         ),
         (g, length * per_variable, rounds * per_variable + apart),
         (gap[None], 2 * J[None], (cancels + products)[None]),

@@ -343,3 +343,28 @@ def test_unstable_plans_prestabilised_or_not():
 def test_many_unstable_plans_prestabilised_or_not():
     assert unstable_faults(range(30)) == []
     assert unstable_faults(range(10), n=8) == []
+
+
+@pytest.mark.slow
+def test_plans_that_rest_at_a_soft_limit():
+    """Where the target is the limit and the state next to it, penalties are rounding alone, 1e4
+    times that of the states; such plans are those of the hard limit."""
+    n, h, rng = 6, 0.01, np.random.default_rng(0)
+    pair, zero = np.eye(n), np.zeros((n, n))
+    push = np.linalg.inv(0.02 * (pair + 0.3))
+    system = jm.LinearSystem(
+        np.block([[pair, h * pair], [zero, pair]]), np.vstack([h * h * push, h * push]), dt=h
+    )
+    weights = np.diag([1.0] * n + [1e-5] * n), 3e-6 * np.eye(n)
+    rows, upper = np.hstack([pair, zero]), np.ones(n)
+    soft = jm.MPC(system, *weights, 10, soft=jm.mpc.Soft(rows, upper=upper, rho=1e4))
+    limits = jm.Outputs(rows, upper=upper, stages=tuple(range(2, 11)))
+    hard = jm.MPC(system, *weights, 10, outputs=limits)
+    aim = np.append(upper, np.zeros(n))
+    with jax.enable_x64(True):
+        for _ in range(10):
+            below, speed = 10.0 ** rng.uniform(-7, -4), 10.0 ** rng.uniform(-6, -3)
+            x0 = aim + np.append(-below * np.abs(rng.normal(size=n)), speed * rng.normal(size=n))
+            plan, other = (jm.solve(mpc, x0, reference=aim) for mpc in (soft, hard))
+            assert plan.status == other.status == jm.Status.SOLVED
+            np.testing.assert_allclose(plan.states, other.states, atol=1e-7)
