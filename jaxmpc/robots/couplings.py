@@ -50,10 +50,12 @@ class Couplings:
 
     def unmet(self, q: np.ndarray) -> str:
         """Return in words which coupling is off the most at q, "" where all are met."""
-        residual = np.abs(self.rows(q)[0]) if self.there else np.zeros(0)
-        if residual.max(initial=0.0) <= _MET:
+        if not self.there:
             return ""
+        residual = np.abs(self.rows(q)[0])
         worst = int(np.argmax(residual))
+        if residual[worst] <= _MET:
+            return ""
         number = self.data.efc_id[worst]
         return f"{name_of(self.model, 'equality', number)} is off by {residual[worst]:.3g}"
 
