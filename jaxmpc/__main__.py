@@ -6,6 +6,7 @@ import signal
 import sys
 import threading
 import warnings
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 
@@ -14,15 +15,21 @@ def main() -> int:
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _stop)  # until the command begins, see `cli.main`
     warnings.formatwarning = lambda message, *_, **__: f"jaxmpc: {message}\n"
+    from jaxmpc.app import cli
+
+    return cli.main(session=session)
+
+
+@contextlib.contextmanager
+def session(words: Sequence[str]) -> Iterator[None]:
+    """Keep what the command in `words` compiles, and start JAX's device beside the imports of its
+    modules; nothing of this for wrong options, which are told at once."""
     from jaxmpc.app.program_cache import KEEPING, kept_programs
 
-    words = sys.argv[1:]
-    with kept_programs(words):  # before JAX is imported
-        if words and words[0] in KEEPING and not {"-h", "--help"} & {*words}:
+    with kept_programs(words):
+        if words[0] in KEEPING:
             threading.Thread(target=_start_device).start()
-        from jaxmpc.app import cli
-
-        return cli.main()
+        yield
 
 
 def _start_device() -> None:

@@ -10,7 +10,7 @@ import zarr
 from test_store import AXES, CONFIG, FIELDS, array_files, bounds, rows
 
 from jaxmpc import store
-from jaxmpc.app.commands.options import chosen_shard
+from jaxmpc.app.options.shared import chosen_shard
 from jaxmpc.store import Store
 from jaxmpc.store.reading import zarr_place
 from jaxmpc.store.writing import Lock

@@ -1,8 +1,8 @@
 """The command `jaxmpc`: parse the command line, run the subcommand, and report how it ended."""
 
-import ast
 import contextlib
 import importlib
+import inspect
 import io
 import json
 import os
@@ -12,155 +12,156 @@ import signal
 import sys
 import time
 import types
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, make_dataclass
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import fields, make_dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import tyro
 
 import jaxmpc
-from jaxmpc.app.commands.options import check_values
+from jaxmpc.app.commands.outcome import Outcome
+from jaxmpc.app.options.export import ExportOptions
+from jaxmpc.app.options.info import InfoOptions
+from jaxmpc.app.options.init import InitOptions
+from jaxmpc.app.options.recursion import RecursionOptions
+from jaxmpc.app.options.report import ReportOptions
+from jaxmpc.app.options.shared import Everywhere, check_values
+from jaxmpc.app.options.simulate import SimulateOptions
+from jaxmpc.app.options.sweep import SweepOptions
+from jaxmpc.app.options.tune_solver import TuneSolverOptions
+from jaxmpc.app.options.tune_weights import TuneWeightsOptions
+from jaxmpc.app.options.verify import VerifyOptions
 from jaxmpc.checks import fail, nearest, printable
 
-# Module and class of each command: only the one that is called is imported. The class is a
-# dataclass of options, its docstring the help, `run()` the command, and `keeps` says what is there
-# of a run that was stopped, which --resume goes on from; "" for nothing (see `commands/init.py`).
+# The options of each command, whose docstring is its help. They need no JAX, which the command
+# does: it is the class of that name without "Options" in `jaxmpc.app.commands`.
 COMMANDS = {
-    "init": ("init", "Init"),
-    "sweep": ("sweep", "Sweep"),
-    "recursion": ("recursion", "Recursion"),
-    "info": ("info", "Info"),
-    "simulate": ("simulate", "Simulate"),
-    "verify": ("verify", "Verify"),
-    "export": ("export", "Export"),
-    "report": ("report", "Report"),
+    "init": InitOptions,
+    "sweep": SweepOptions,
+    "recursion": RecursionOptions,
+    "info": InfoOptions,
+    "simulate": SimulateOptions,
+    "verify": VerifyOptions,
+    "export": ExportOptions,
+    "report": ReportOptions,
 }
+TUNERS = {"weights": TuneWeightsOptions, "solver": TuneSolverOptions}
+TUNE = "Learn what is usually guessed: an MPC's weights, or the penalties of its solver."
 DESCRIPTION = """Constrained MPC in batches, with proofs. Also: jaxmpc --version
 
 Every command takes --quiet (errors alone), --json (one JSON object in place of tables),
 --format {pdf,svg,png} (pictures in this format beside PNG) and --width {page,column} (of maps, for
 papers). docs/how-to/commands.md tells more."""
-# How pictures can be, and the files in which commands keep their results as JSON.
-CHOICES = {"--format": ("pdf", "svg", "png"), "--width": ("page", "column")}
+# Files in which commands keep their results as JSON.
 RECORDS = ("summary.json", "tuning.json", "solver.json")
 # What the line of an error begins with.
 ERROR = "jaxmpc: error: "
 # Options of tyro that write a completion script for a shell, and the words that each needs.
 COMPLETIONS = {"--tyro-print-completion": 2, "--tyro-write-completion": 3}
-TUNE = "Learn what is usually guessed: an MPC's weights, or the penalties of its solver."
-TUNERS = {"weights": ("tune_weights", "TuneWeights"), "solver": ("tune_solver", "TuneSolver")}
+# What surrounds the work of a command, given its words.
+Session = Callable[[Sequence[str]], AbstractContextManager[None]]
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command and return its exit code: 0 done, 2 error, 130 interrupted, 141 nobody reads
-    its output any more."""
+def main(
+    argv: Sequence[str] | None = None, session: Session = lambda words: contextlib.nullcontext()
+) -> int:
+    """Run a command and return its exit code: 0 done, 1 not verified, 2 error, 130 interrupted,
+    141 nobody reads its output any more.
+
+    session: entered once the options are known to be right, before JAX is imported.
+    """
     argv = list(sys.argv[1:] if argv is None else argv)
-    everywhere = Everywhere()
     for stream in (sys.stdout, sys.stderr):  # what their encoding lacks becomes "?"
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
     if argv == ["--version"]:
         print(f"jaxmpc {jaxmpc.__version__}")
         return 0
+    words = command_first(argv)
     try:
-        everywhere, words = options_of_all(argv)
-        command = parse(words)
+        everywhere, options = parse(words)
+        check_values(options)
     except BrokenPipeError:
         return without_reader()
-    except (ValueError, OSError, AssertionError) as error:  # tyro asserts that it knows a shell
+    # tyro asserts that it knows a shell, and needs a package for some.
+    except (ValueError, OSError, AssertionError, ImportError) as error:
         return report_error(str(error))
-    if everywhere.format is not None or everywhere.width == "column":
+    if everywhere.format != "png" or everywhere.width == "column":
         import matplotlib
 
-        matplotlib.rcParams["savefig.format"] = everywhere.format or "png"
+        matplotlib.rcParams["savefig.format"] = everywhere.format
         if everywhere.width == "column":  # which `jaxmpc.app.plots` reads
             matplotlib.rcParams["figure.figsize"] = (3.5, 3.6)
             matplotlib.rcParams["font.size"] = 8
     if not (everywhere.quiet or everywhere.json):
-        with plain_output():
-            return run(command, argv)
+        with plain_output(), session(words):
+            return run(options, argv).code
     said, begun = io.StringIO(), time.time()
-    with plain_output(said, OnlyErrors(sys.stderr)):
-        code = run(command, argv)
+    with plain_output(said, OnlyErrors(sys.stderr)), session(words):
+        outcome = run(options, argv)
     if everywhere.json:
-        print(json.dumps(as_json(command, words, code, said.getvalue(), begun), indent=2))
-    return code
+        found = as_json(options, outcome, said.getvalue(), begun)
+        name = " ".join(words[: 2 if words[0] == "tune" else 1])
+        print(json.dumps({"command": name} | found, indent=2))
+    return outcome.code
 
 
-@dataclass(frozen=True)
-class Everywhere:
-    """Options that every command takes.
-
-    quiet: print errors alone. json: print one JSON object in place of tables. format: of pictures,
-    beside PNG; None for PNG alone. width: of pictures, "page" or "column".
-    """
-
-    quiet: bool = False
-    json: bool = False
-    format: str | None = None
-    width: str = "page"
+def command_first(argv: Sequence[str]) -> list[str]:
+    """Return the words with the command before options that stand before it, such as those of
+    `jaxmpc --json sweep`."""
+    if not argv or not argv[0].startswith("-") or argv[0] in COMPLETIONS:
+        return list(argv)
+    place = next((i for i, word in enumerate(argv) if word in (*COMMANDS, "tune")), 0)
+    end = place + 1 + (argv[place] == "tune")
+    return [*argv[place:end], *argv[:place], *argv[end:]]
 
 
-def options_of_all(argv: Sequence[str]) -> tuple[Everywhere, list[str]]:
-    """Return the options that every command takes, and the other words. Raises ValueError for a
-    format or a width that there is not."""
-    found: dict[str, Any] = {}
-    rest, words = list[str](), list(argv)
-    while words:
-        word = words.pop(0)
-        name, equals, value = word.partition("=")
-        if word in ("--quiet", "--json"):
-            found[word[2:]] = True
-        elif name in CHOICES:
-            value = value if equals else words.pop(0) if words else "no value"
-            if value not in CHOICES[name]:
-                fail(name, value, f"Give one of {', '.join(CHOICES[name])}")
-            found[name[2:]] = value
-        else:
-            rest.append(word)
-    return Everywhere(**found), rest
-
-
-def as_json(
-    command: Any, words: Sequence[str], code: int, said: str, begun: float
-) -> dict[str, Any]:
-    """Return what a command came to: its exit code, the lines that it printed, and what it wrote
-    as JSON into its folder since `begun`."""
-    folder: Any = getattr(command, "output", None)
-    summary = None
-    for name in RECORDS if folder is not None else ():
+def as_json(options: Any, outcome: Outcome, said: str, begun: float) -> dict[str, Any]:
+    """Return what a command came to: its exit code, the lines that it printed, and its results, or
+    those that it wrote as JSON into its folder since `begun`."""
+    folder: Any = getattr(options, "output", None)
+    summary = outcome.summary
+    for name in RECORDS if folder is not None and summary is None else ():
         path = Path(folder) / name
         if path.is_file() and path.stat().st_mtime >= begun - 1:
             summary = json.loads(path.read_text(encoding="utf-8"))
     return {
-        "command": " ".join(words[: 2 if words[:1] == ["tune"] else 1]),
-        "exit_code": code,
+        "exit_code": outcome.code,
         "output": None if folder is None else str(folder),
         "lines": said.splitlines(),
         "summary": summary,
     }
 
 
-def run(command: Any, argv: Sequence[str]) -> int:
-    """Run a parsed command and return its exit code."""
-    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # as in the background
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+def run(options: Any, argv: Sequence[str]) -> Outcome:
+    """Run the command of these options, and return what it came to."""
     try:
-        check_values(command)
-        return command.run() or 0
+        command = command_of(options)
+        if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # as in the background
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+        return command.run() or Outcome()
     except BrokenPipeError:
-        return without_reader()
+        return Outcome(without_reader())
     except (ValueError, OSError, MemoryError, ImportError) as error:
-        return report_error(named_options(str(error), command))
+        return Outcome(report_error(named_options(str(error), options)))
     except KeyboardInterrupt:
-        if not command.keeps:
+        if not options.keeps:
             print("\nstopped; nothing is kept")
-            return 130
+            return Outcome(130)
         again = [word for word in argv if word not in ("--overwrite", "--resume")]
         resume = shlex.join(["jaxmpc", *again, "--resume"])
-        print(f"\nstopped; {command.keeps} that were done are kept. Go on with:\n  {resume}")
-        return 130
+        print(f"\nstopped; {options.keeps} that were done are kept. Go on with:\n  {resume}")
+        return Outcome(130)
+
+
+def command_of(options: Any) -> Any:
+    """Return the command with these options. Imports its module, and with it JAX."""
+    kind = type(options)
+    place = kind.__module__.replace("jaxmpc.app.options", "jaxmpc.app.commands")
+    found = getattr(importlib.import_module(place), kind.__name__.removesuffix("Options"))
+    return found(**vars(options))
 
 
 def without_reader() -> int:
@@ -170,72 +171,98 @@ def without_reader() -> int:
     return 128 + signal.SIGPIPE
 
 
-def named_options(message: str, command: Any) -> str:
+def named_options(message: str, options: Any) -> str:
     """Return an error of the library, which begins with its arguments, with their options."""
     names, colon, rest = message.partition(": ")
-    if names == str(getattr(command, "output", None)):
+    if names == str(getattr(options, "output", None)):
         return f"--output {message}"
-    known = {field.name for field in fields(command)}
+    known = {field.name for field in fields(options)}
     option_of = lambda word: f"--{word[0].replace('_', '-')}" if word[0] in known else word[0]
     if re.fullmatch(r"\w+(,? \w+)*", names):
         names = re.sub(r"\w+", option_of, names)
     return names + colon + rest
 
 
-def parse(argv: Sequence[str]) -> Any:
-    """Return the command with its options.
+def parse(argv: Sequence[str]) -> tuple[Everywhere, Any]:
+    """Return the options that every command takes, and those of the command that is called.
 
     `jaxmpc COMMAND --help` prints a page; `jaxmpc --help` and `jaxmpc tune --help` one line each.
     Raises ValueError for commands, options and values that there are not.
     """
-    prog, table, words = "jaxmpc", COMMANDS, list(argv)
+    prog, words = "jaxmpc", list(argv)
+    table: dict[str, Any] = COMMANDS
     if words[:1] == ["tune"]:
         prog, table, words = "jaxmpc tune", TUNERS, words[1:]
     if words and words[0] in table:
-        kind = _class(*table[words[0]])
-        return parse_options(kind, f"{prog} {words[0]}", words[1:])
+        return parse_options(table[words[0]], f"{prog} {words[0]}", words[1:])
     first = words[0] if words else ""
     if first not in ("-h", "--help") and not 0 < COMPLETIONS.get(first, 0) <= len(words):
         known = [*table, *(["tune"] if table is COMMANDS else [])]
         given = f"no command {first!r}" if words else "no command given"
         fail(prog, given, f"{nearest(first, known)}There are {', '.join(known)}; see {prog} --help")
-    # A list of the commands needs none of their options, hence neither JAX nor their modules.
-    listed = lambda module, kind: make_dataclass(kind, ())
-    options = listed if first in ("-h", "--help") else _class
-    described = [
-        _described(name, options(*where), first_line(*where)) for name, where in table.items()
-    ]
+    choices = subcommands(table)
     if table is COMMANDS:
-        described.append(_described("tune", make_dataclass("Tune", ()), TUNE))
-    choice: Any = Union[tuple(described)]  # noqa: UP007
+        tuner: Any = Union[subcommands(TUNERS)]  # noqa: UP007
+        choices += (described("tune", make_dataclass("Tune", [("quantity", tuner)]), TUNE),)
+    choice: Any = Union[choices]  # noqa: UP007
     text = TUNE if table is TUNERS else DESCRIPTION
-    return tyro.cli(choice, prog=prog, description=text, args=words)
+    plain = tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes  # no "quantity:weights"
+    tyro.cli(choice, prog=prog, description=text, args=words, config=plain)  # prints, and exits
+    raise AssertionError(f"{words} are no command")
 
 
-def parse_options(kind: Any, prog: str, words: Sequence[str]) -> Any:
-    """Return a command of this class with the options in `words`.
+def subcommands(table: dict[str, Any]) -> tuple[Any, ...]:
+    """Return the commands of a table, each as a subcommand."""
+    return tuple(
+        described(name, with_common(kind), kind.__doc__ or "") for name, kind in table.items()
+    )
+
+
+def described(name: str, kind: Any, text: str) -> Any:
+    """Return the class as a subcommand, with the first line of a text."""
+    return Annotated[kind, tyro.conf.subcommand(name, description=text.partition("\n")[0])]
+
+
+def with_common(kind: Any) -> Any:
+    """Return a class of the options of a command, and after them those of `Everywhere`."""
+    return make_dataclass(kind.__name__, (), bases=(Everywhere, kind), frozen=True)
+
+
+def parse_options(kind: Any, prog: str, words: Sequence[str]) -> tuple[Everywhere, Any]:
+    """Return the options that every command takes, and those of this class.
 
     Raises ValueError, which names the option and what it takes, where tyro would print some lines.
     """
-    known = {f"--{field.name.replace('_', '-')}": field.name for field in fields(kind)}
+    both = with_common(kind)
+    known = {f"--{field.name.replace('_', '-')}": field.name for field in fields(both)}
     text = io.StringIO()
     try:
         with contextlib.redirect_stderr(text):
-            command, rest = tyro.cli(kind, prog=prog, args=words, return_unknown_args=True)
+            found, rest = tyro.cli(
+                both,
+                prog=prog,
+                description=inspect.getdoc(kind),
+                args=words,
+                return_unknown_args=True,
+            )
     except SystemExit as stop:
         if not stop.code:
             raise
-        found = next((w for w in re.findall(r"--[\w-]+", text.getvalue()) if w in known), None)
-        if found is None:
+        name = next((w for w in re.findall(r"--[\w-]+", text.getvalue()) if w in known), None)
+        if name is None:
             fail(prog, " ".join(re.sub(r"[^ -~]", " ", text.getvalue()).split()), "")
-        wanted = f"Give {described_type(get_type_hints(kind)[known[found]])}"
-        fail(found, values_of(found, words), f"{wanted}; see {prog} --help")
+        wanted = f"Give {described_type(get_type_hints(both)[known[name]])}"
+        fail(name, values_of(name, words), f"{wanted}; see {prog} --help")
     if rest:
         what = "no such option" if rest[0].startswith("-") else "belongs to no option"
         switches = [f"--no-{field.name}" for field in fields(kind) if field.default is True]
         meant = nearest(rest[0].partition("=")[0], [*known, *switches, "--help"])
         fail(rest[0], what, f"{meant}See {prog} --help")
-    return command
+    common, options = (
+        part(**{field.name: getattr(found, field.name) for field in fields(part)})
+        for part in (Everywhere, kind)
+    )
+    return common, options
 
 
 def values_of(option: str, words: Sequence[str]) -> str:
@@ -263,25 +290,6 @@ def described_type(kind: Any) -> str:
         inner = get_args(kind)[0]
         return {int: "whole numbers", float: "numbers"}.get(inner) or described_type(inner)
     return {int: "a whole number", float: "a number", Path: "a path"}.get(kind, "a text")
-
-
-def _class(module: str, name: str) -> Any:
-    """Import a command's module and return its class."""
-    return getattr(importlib.import_module(f"jaxmpc.app.commands.{module}"), name)
-
-
-def first_line(module: str, name: str) -> str:
-    """Return the first line of the docstring of a command's class, read from its source: to import
-    the module would take seconds."""
-    source = (Path(__file__).parent / "commands" / f"{module}.py").read_text(encoding="utf-8")
-    classes = (node for node in ast.parse(source).body if isinstance(node, ast.ClassDef))
-    found = next(node for node in classes if node.name == name)
-    return (ast.get_docstring(found) or "").partition("\n")[0]
-
-
-def _described(name: str, kind: Any, text: str) -> Any:
-    """Return the class as a subcommand with this description."""
-    return Annotated[kind, tyro.conf.subcommand(name, description=text)]
 
 
 class Plain:

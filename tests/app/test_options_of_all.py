@@ -1,6 +1,12 @@
 """Options that every command takes: --quiet, --json, --format."""
 
+import dataclasses
 import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
 
 import matplotlib
 import matplotlib.pyplot as plt
@@ -10,9 +16,14 @@ from matplotlib.figure import Figure
 
 import jaxmpc as jm
 from jaxmpc.app import cli
+from jaxmpc.app.commands import info, init, sweep
+from jaxmpc.app.options.shared import Everywhere
 from jaxmpc.app.plots import plot_body
 from jaxmpc.app.plots.maps import finish, new_axes
 from jaxmpc.app.plots.style import save
+from jaxmpc.recursion.proofs import Claim
+from jaxmpc.verify.stored_map import Verification
+from jaxmpc.workflow.offline_checks import NominalLoops, OfflineReport
 
 
 def test_quiet_prints_errors_alone(tmp_path, capsys):
@@ -45,15 +56,77 @@ def test_json_has_the_summary(tmp_path, capsys, monkeypatch):
         (self.output / "summary.json").write_text('{"counts": {"feasible": 3}}')
         print("  feasible  3")
 
-    verify = cli._class("verify", "Verify")
-    command = cli._class("sweep", "Sweep")
-    assert not hasattr(verify, "summary")
-    monkeypatch.setattr(command, "run", run)
+    monkeypatch.setattr(sweep.Sweep, "run", run)
     assert cli.main(["sweep", "--json", "--output", str(tmp_path / "o")]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["summary"] == {"counts": {"feasible": 3}} and found["output"] == str(
         tmp_path / "o"
     )
+
+
+def summary_of(line, capsys, code=0):
+    """What a command prints with --json, which is one object, as its `summary`."""
+    assert cli.main(["--json", *line.split()]) == code
+    found = json.loads(capsys.readouterr().out)
+    assert found["command"] == line.split()[0] and found["exit_code"] == code and found["lines"]
+    return found["summary"]
+
+
+def test_json_of_verify_has_the_fields_of_a_verification(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    counts = summary_of("sweep --grid 8 8 --horizon 5 --output map", capsys)["counts"]
+    found = summary_of("verify map", capsys)
+    assert found.keys() == {"passed"} | {f.name for f in dataclasses.fields(Verification)}
+    assert found["passed"] and found["verified"] == 64 and not found["failures"]
+    assert found["labels"].items() <= counts.items()
+    (tmp_path / "map" / "summary.json").unlink()
+    found = summary_of("verify map", capsys, code=1)
+    assert not found["passed"] and "is missing" in found["problems"][0]
+
+
+def test_json_of_info_has_the_fields_of_a_report(capsys):
+    """In the time that is given only the first parts; notes say why the others are None."""
+    found = summary_of("info --horizon 3 --seconds 1", capsys)
+    names = {field.name for field in dataclasses.fields(OfflineReport)} - {"mpc"}
+    assert found.keys() == names | {"name"}
+    assert found["feasible_set"] is None and "no time was left" in found["notes"]["feasible_set"]
+    assert found["loops"] is None and "loops" in found["notes"]
+    checks = {check["name"]: check["holds"] for check in found["terminal"]["checks"]}
+    assert checks["R positive definite"] is True and checks["control invariance"] is False
+    assert "terminal" not in found["notes"]
+    # Sizes: 3 inputs; limits of both states and of the input at 3 steps.
+    assert (found["variables"], found["rows"]) == (3, 9)
+
+
+def test_json_of_export_has_files_and_regions(tmp_path, capsys):
+    line = f"export --law explicit --horizon 2 --output {tmp_path}"
+    found = summary_of(line, capsys)
+    assert found["law"] == "explicit" and found["regions"] >= 3
+    assert {Path(path) for path in found["files"]} == set(tmp_path.iterdir())
+
+
+def test_fields_of_the_report_are_those_of_its_parts():
+    """The parts that `jaxmpc info --json` leaves out without time."""
+    claim = Claim(False, "why", np.ones(2))
+    report = SimpleNamespace(
+        volume=(1.0, np.inf), variables=1, rows=2, condition=3.0, notes={"penalty": "time"},
+        feasible_set=SimpleNamespace(counts=lambda: {"feasible": 4}), penalty=None, terminal=None,
+        recursion=SimpleNamespace(
+            claims={"law": claim}, loops=SimpleNamespace(counts=lambda: {"kept": 5}),
+            volume=1.0, lost_by_any=np.nan, lost_by_law=0.1,
+        ),
+        loops=NominalLoops(np.zeros((6, 2)), 7, 5, 0.0, 0.0, 0.25, np.zeros(2), 0.5),
+    )  # fmt: skip
+    found = info.record(report)
+    assert found["volume"] == {"inner": 1.0, "outer": None}
+    assert found["feasible_set"] == {"counts": {"feasible": 4}} and found["notes"] == {
+        "penalty": "time"
+    }
+    assert found["recursion"]["claims"] == {
+        "law": {"holds": False, "reason": "why", "state": [1.0, 1.0]}
+    }
+    assert found["recursion"]["lost_by_any"] is None and found["recursion"]["lost_by_law"] == 0.1
+    assert (found["loops"]["starts"], found["loops"]["increase"]) == (6, 0.25)
 
 
 @pytest.mark.parametrize("words", [["--format", "gif"], ["--format=gif"], ["--format"]])
@@ -65,7 +138,7 @@ def test_other_formats_are_refused(words, capsys):
 def test_pictures_in_another_format(tmp_path, monkeypatch, capsys):
     """Beside PNG, which stays; with another format the one of before goes."""
     monkeypatch.setitem(matplotlib.rcParams, "savefig.format", "png")
-    monkeypatch.setattr(cli._class("init", "Init"), "run", lambda self: save(figure, path))
+    monkeypatch.setattr(init.Init, "run", lambda self: save(figure, path))
     figure, path = Figure(), tmp_path / "map.png"
     figure.add_subplot().set_title("Ж", loc="left")
     for name, others in (("pdf", {".pdf"}), ("svg", {".svg"}), ("png", set())):
@@ -88,7 +161,7 @@ def test_pictures_for_a_column(tmp_path, monkeypatch):
         finish(ax, ["a [m]", "b [m]"], "A title", ax.lines[:])
         save(ax.figure, path)
 
-    monkeypatch.setattr(cli._class("init", "Init"), "run", run)
+    monkeypatch.setattr(init.Init, "run", run)
     assert cli.main(["init", "--width", "column"]) == 0
     width = plt.imread(path).shape[1] / 150
     assert 3.0 < width < 3.9
@@ -117,3 +190,50 @@ def test_help_names_them(capsys):
         cli.main(["--help"])
     out = capsys.readouterr().out
     assert all(word in out for word in ("--quiet", "--json", "--format"))
+
+
+COMPLETE = """
+source ./script
+for command in "" tune {commands}; do
+  COMP_WORDS=(jaxmpc $(echo $command | tr / ' ') --); COMP_CWORD=$((${{#COMP_WORDS[@]}} - 1))
+  _tyro_jaxmpc; echo "$command:${{COMPREPLY[*]}}"
+done
+COMP_WORDS=(jaxmpc tune ""); COMP_CWORD=2; _tyro_jaxmpc; echo "words:${{COMPREPLY[*]}}"
+COMP_WORDS=(jaxmpc sweep --terminal ""); COMP_CWORD=3; _tyro_jaxmpc; echo "sets:${{COMPREPLY[*]}}"
+"""
+
+
+@pytest.mark.skipif(
+    not (shutil.which("bash") and shutil.which("python3")), reason="its script calls python3"
+)
+def test_each_option_of_each_command_is_completed(tmp_path):
+    """By bash itself, with the script that the page of commands tells to make."""
+    main = [sys.executable, "-m", "jaxmpc", "--tyro-write-completion", "bash", "script"]
+    subprocess.run(main, cwd=tmp_path, check=True)
+    kinds = cli.COMMANDS | {f"tune/{name}": kind for name, kind in cli.TUNERS.items()}
+    ask = COMPLETE.format(commands=" ".join(kinds))
+    said = subprocess.run(["bash", "-c", ask], cwd=tmp_path, capture_output=True, text=True)
+    answers = dict(line.split(":", 1) for line in said.stdout.splitlines())
+    for name, kind in kinds.items():
+        options = {
+            f"--{'' if field.default is not True else 'no-'}{field.name.replace('_', '-')}"
+            for part in (kind, Everywhere)
+            for field in dataclasses.fields(part)
+            if field.name not in ("directory", "folder")
+        }
+        found = answers[name].split()
+        assert options <= set(found), name
+        assert all(word.startswith("--") for word in found), name
+    assert {"weights", "solver"} <= set(answers["words"].split())
+    assert {"invariant", "box", "none", "ellipsoid"} == set(answers["sets"].split())
+
+
+@pytest.mark.parametrize("shell", ["zsh", "fish"])
+def test_scripts_of_other_shells_name_all_options(shell, capsys):
+    with pytest.raises(SystemExit):
+        cli.main(["--tyro-print-completion", shell])
+    out = capsys.readouterr().out
+    names = {field.name for kind in cli.COMMANDS.values() for field in dataclasses.fields(kind)}
+    for name in names - {"directory", "folder"}:
+        assert f"--{name.replace('_', '-')}" in out
+    assert "quantity" not in out

@@ -2,80 +2,24 @@
 
 import dataclasses
 import io
-from pathlib import Path
-from typing import Annotated
+from typing import Any
 
 from jaxmpc.app import config as configs
 from jaxmpc.app.commands import report as page
-from jaxmpc.app.commands.options import (
-    POSITIVE,
-    Horizon,
-    ProblemFile,
-    Terminal,
-    at_least,
+from jaxmpc.app.commands.outcome import Outcome
+from jaxmpc.app.options.info import InfoOptions
+from jaxmpc.app.options.shared import (
     given_options,
-    option,
 )
 from jaxmpc.checks import fail
+from jaxmpc.files import as_json
 from jaxmpc.workflow.offline_checks import OfflineReport, offline_report
 
 
-@dataclasses.dataclass(frozen=True)
-class Info:
-    """What is known of this controller before it runs: an offline test report.
+class Info(InfoOptions):
+    """The command: its options, and `run`."""
 
-    What it does
-      Prints, for a constrained linear MPC:
-        Problem                 sizes, and each limit with the steps at which it holds
-        Feasible set            proved bounds of its volume (up to three states), sampled labels
-        Recursive feasibility   the claims of jaxmpc recursion, proved, refuted or open
-        Exact penalty           the L1 weight above which soft limits are kept wherever they can be
-        Terminal ingredients    each hypothesis of the theorems on recursive feasibility (1) and
-                                stability (3): holds or not, by how much
-        Closed loops            nominal runs from feasible states: violations, Lyapunov decrease
-      Soft limits count as hard, but for the closed loops.
-      Without a file the problem is one robot joint: x = (q, dq), torque u, 20 steps of 0.01 s.
-      An option given here wins over the file.
-
-    How to start
-      $ jaxmpc info
-      $ jaxmpc info --config pendulum.toml --terminal invariant --html pendulum.html
-
-    How long it takes
-      Each stage is announced on stderr as it begins, with the seconds spent so far.
-        terminal ingredients, recursive feasibility, exact penalty: seconds for two states, minutes
-        for four; map of the feasible set: some 15 s of compiling, then seconds; closed loops: 20 s
-        of compiling, then seconds.
-      --seconds bounds all of these together; start-up takes some 3 s more. Compiling and a linear
-      program cannot be interrupted: what compiles is left out, and the report says so, where it
-      does not fit.
-
-    How to read the output
-      "proved" rests on linear programs or certificates with the tolerance that is named, "refuted"
-      on a counterexample; closed loops are simulated, not proved. Nothing is written to disk
-      but the page of --html.
-      Exit code  0 done, for any answers; 2 error (one line on stderr says which); 130 stopped by
-                 Ctrl-C.
-
-    What the TOML file holds
-      The sections [system], [limits], [cost], [mpc] of jaxmpc sweep --help.
-    """
-
-    config: ProblemFile = None
-    horizon: Horizon = None
-    terminal: Terminal = None
-    steps: Annotated[int, option("K", "50"), at_least(2)] = 50
-    """Length of the closed loops."""
-    loops: Annotated[int, option("K", "128"), at_least(1)] = 128
-    """Number of the closed loops."""
-    seconds: Annotated[float, option("S", "120"), POSITIVE] = 120.0
-    """Time for all of it; claims not settled by then are open."""
-    html: Annotated[Path | None, option("FILE", "none")] = None
-    """Write the report as a page too, with a picture of a feasible set of two states."""
-
-    keeps = ""
-
-    def run(self) -> None:
+    def run(self) -> Outcome:
         """Print the report. Raises ValueError for options and files that make no sense."""
         if self.html is not None and not self.html.parent.is_dir():
             fail(f"--html {self.html}", "its folder does not exist", "Make it, or give another")
@@ -92,6 +36,46 @@ class Info:
             parts = [*_pictures(report), page.text("Offline report", str(report))]
             parts.append(page.table("Configuration", config.to_dict("info")))
             self.html.write_text(page.html_page(config.name, parts), encoding="utf-8")
+        return Outcome(summary={"name": config.name, **record(report)})
+
+
+def record(report: OfflineReport) -> dict[str, Any]:
+    """Return a report as JSON data, under the names that its parts have in Python; None for a part
+    that was not done, with the reason in notes."""
+    low, high = report.volume
+    found: dict[str, Any] = {
+        "variables": report.variables,
+        "rows": report.rows,
+        "condition": report.condition,
+        "volume": {"inner": low, "outer": high},
+        "feasible_set": None,
+        "recursion": None,
+        "penalty": None,
+        "terminal": None,
+        "loops": None,
+    }
+    entries = lambda part, *names: {name: getattr(part, name) for name in names}
+    if report.feasible_set is not None:
+        found["feasible_set"] = {"counts": report.feasible_set.counts()}
+    if report.recursion is not None:
+        claims = report.recursion.claims.items()
+        found["recursion"] = {
+            "claims": {name: dataclasses.asdict(claim) for name, claim in claims},
+            "counts": report.recursion.loops.counts(),
+            **entries(report.recursion, "volume", "lost_by_any", "lost_by_law"),
+        }
+    if report.penalty is not None:
+        names = "rho_bar at label method exact advised sufficient".split()
+        found["penalty"] = entries(report.penalty, *names)
+    if report.terminal is not None:
+        names = "recursive_feasibility stability factor".split()
+        checks = [dataclasses.asdict(check) for check in report.terminal.checks]
+        found["terminal"] = {**entries(report.terminal, *names), "checks": checks}
+    if report.loops is not None:
+        names = "steps feasible violation slack increase worst_x0 left".split()
+        found["loops"] = {"starts": len(report.loops.x0s), **entries(report.loops, *names)}
+    found["notes"] = {name: why for name, why in report.notes.items() if found[name] is None}
+    return as_json(found)
 
 
 def _pictures(report: OfflineReport) -> list[str]:

@@ -1,15 +1,13 @@
 """The command `jaxmpc report`: one HTML file with tables, text and pictures inside."""
 
 import base64
-import dataclasses
 import html
 import json
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import tyro
-
+from jaxmpc.app.options.report import ReportOptions
 from jaxmpc.checks import fail
 from jaxmpc.files import text_within
 
@@ -24,24 +22,8 @@ STYLE = (
 )
 
 
-@dataclasses.dataclass(frozen=True)
-class Report:
-    """Make one HTML page of a folder of results: tables and pictures in a single file.
-
-    What it does
-      Reads the results and the pictures of a folder that sweep, recursion, simulate or tune
-      wrote, and writes report.html beside them: results, pictures, configuration and versions. The
-      file needs no other and no network. The page of a design is jaxmpc info --html FILE.
-
-    How to start
-      $ jaxmpc sweep
-      $ jaxmpc report jaxmpc-sweep
-    """
-
-    folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
-    """Folder that a command wrote."""
-
-    keeps = ""
+class Report(ReportOptions):
+    """The command: its options, and `run`."""
 
     def run(self) -> None:
         """Write the page. Raises ValueError for a folder without a readable summary."""

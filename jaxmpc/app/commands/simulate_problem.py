@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxmpc.app import config as configs
 from jaxmpc.app.commands.compile_notice import Compiling
-from jaxmpc.app.commands.options import print_table
+from jaxmpc.app.options.shared import print_table
 from jaxmpc.checks import fail, require_memory
 from jaxmpc.closed_loop.disturbances import draw_disturbances, worst_disturbance
 from jaxmpc.closed_loop.simulation import Run, simulate

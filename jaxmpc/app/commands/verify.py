@@ -6,64 +6,28 @@ import time
 from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import tyro
 
 from jaxmpc.app import config as configs
-from jaxmpc.app.commands.options import Switch, at_least, option, print_table
+from jaxmpc.app.commands.outcome import Outcome
+from jaxmpc.app.options.shared import print_table
+from jaxmpc.app.options.verify import VerifyOptions
 from jaxmpc.checks import shown
 from jaxmpc.feasible.policy_problem import problem_of
+from jaxmpc.files import as_json
 from jaxmpc.verify.stored_map import Verification, find_store, verify_map
 
 # Failures that are printed.
 SHOWN = 10
 
 
-@dataclasses.dataclass(frozen=True)
-class Verify:
-    """Prove every label of a stored map again, from what is stored alone.
+class Verify(VerifyOptions):
+    """The command: its options, and `run`."""
 
-    What it does
-      Reads the map that jaxmpc sweep left in DIR, or the report of jaxmpc recursion, either with
-      --robot or without. Metadata, configuration, data and summary.json are compared with their
-      checksums and with each other, and the problem with the one that the configuration gives
-      (that of a robot where its file is here). What is damaged is named in one line, and nothing is
-      proved where data cannot be read. Else proves each label:
-        feasible    the stored plan is rolled out from the state and keeps every limit
-        infeasible  a half-space that no feasible state leaves, made anew, excludes the state
-      by a roll-out and by weak duality of their own (jaxmpc/verify/exact.py, to be read by
-      a sceptic). Half-spaces are evaluated in exact arithmetic, plans in float64 with a bound on
-      its rounding, and exactly where that leaves a doubt and on a sample. Of a recursion report
-      the counterexample is proved too, and each state that counts as lost after one step.
-      Nothing is written.
-
-    How to start
-      $ jaxmpc sweep && jaxmpc verify jaxmpc-sweep
-      $ jaxmpc verify maps/a --exact
-
-    How to read the output
-      verified      Labels that are proved, and how many of them in exact arithmetic.
-      least margin  The least room that a plan leaves to a limit, in the units of that limit. Plans
-                    of states near the boundary touch a limit: 0 is no fault.
-      Exit code     0 all labels are proved; 1 something fails, with the states where; 2 error.
-    """
-
-    directory: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
-    """Folder that holds sweep.zarr, robot_map.zarr or recursion.npz, one of these, or the URL of a
-    store."""
-    exact: Switch = False
-    """Roll out all plans in exact arithmetic."""
-    sample: Annotated[int, option("K", "1000"), at_least(0)] = 1000
-    """Plans to roll out exactly without --exact, drawn at random."""
-    seed: Annotated[int, option("K", "0"), at_least(0)] = 0
-    """Seed of that draw."""
-
-    keeps = ""
-
-    def run(self) -> int:
-        """Verify, print the table or what is damaged, return the exit code. Raises ValueError where
+    def run(self) -> Outcome:
+        """Verify, print the table or what is damaged, return how it ended. Raises ValueError where
         there is no map."""
         path, begun = find_store(self.directory), time.perf_counter()
         found = verify_map(
@@ -80,7 +44,7 @@ class Verify:
         if not found.labels:
             rest = f" (and {len(found.problems) - 1} more)" if len(found.problems) > 1 else ""
             print(f"{path}: NOT VERIFIED: {found.problems[0]}{rest}")
-            return 1
+            return Outcome(1, record(found))
         decided = found.labels.get("feasible", 0) + found.labels.get("infeasible", 0)
         word = "verified" if decided else "nothing to verify, no state is labelled"
         print(f"{path}: {word if found.passed else 'NOT VERIFIED'}")
@@ -96,7 +60,12 @@ class Verify:
         more = len(found.problems[SHOWN:]) + len(list(found.failures)[SHOWN:])
         if more:
             print(f"  and {more:,} more")
-        return 0 if found.passed else 1
+        return Outcome(0 if found.passed else 1, record(found))
+
+
+def record(found: Verification) -> dict[str, Any]:
+    """Return what was verified as JSON data, under the names of `Verification`."""
+    return as_json({"passed": found.passed, **dataclasses.asdict(found)})
 
 
 def contradictions(attributes: Mapping[str, Any], axes: Mapping[str, np.ndarray]) -> list[str]:

@@ -12,12 +12,15 @@ import tyro
 from jaxmpc.checks import MOST_COUNT, fail
 
 
-def option(metavar: str | None, default: str, text: str | None = None) -> Any:
+def option(metavar: str | None, default: str, text: str | None = None, kind: Any = None) -> Any:
     """Return the tyro annotation that sets how an option and its default appear in the help.
 
-    text: its meaning, where that is not the string below the field.
+    text: its meaning, where that is not the string below the field, such as of more than one line,
+    which shells do not complete. kind: the type of a value that is given, where the field may be
+    None.
     """
-    return tyro.conf.arg(metavar=metavar, help_behavior_hint=f"(default: {default})", help=text)
+    hint = f"(default: {default})"
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint=hint, help=text, constructor=kind)
 
 
 @dataclass(frozen=True)
@@ -61,6 +64,8 @@ def check_values(command: Any) -> None:
                     values.check(name, value)
 
 
+TerminalSet = Literal["none", "invariant", "ellipsoid", "box"]
+Precision = Literal["float32", "float64"]
 ProblemFile = Annotated[
     Path | None, option("FILE", "the built-in joint", "TOML file with the problem.")
 ]
@@ -68,12 +73,13 @@ Horizon = Annotated[
     int | None, option("N", "from the file; joint 20", "Prediction horizon, in steps of dt.")
 ]
 Terminal = Annotated[
-    Literal["none", "invariant", "ellipsoid", "box"] | None,
+    TerminalSet | None,
     option(
         "{none,invariant,ellipsoid,box}",
         "from the file, else none",
         "Set for the last state: none, largest set or largest ellipsoid that the LQR keeps within "
         "limits, state limits.",
+        TerminalSet,
     ),
 ]
 End = Annotated[
@@ -118,6 +124,20 @@ Overwrite = Annotated[
     tyro.conf.FlagCreatePairsOff,
     option(None, "off", "Delete the run in --output and start again."),
 ]
+
+
+@dataclass(frozen=True)
+class Everywhere:
+    """Options that every command takes."""
+
+    quiet: Switch = False
+    """Print errors alone."""
+    json: Switch = False
+    """Print one JSON object in place of tables."""
+    format: Annotated[Literal["pdf", "svg", "png"], option("{pdf,svg,png}", "png")] = "png"
+    """Write pictures in this format too, beside PNG."""
+    width: Annotated[Literal["page", "column"], option("{page,column}", "page")] = "page"
+    """Draw maps for a page, or 3.5 inches wide for a column of a paper."""
 
 
 def chosen_shard(text: str, environment: Mapping[str, str]) -> tuple[int, int]:

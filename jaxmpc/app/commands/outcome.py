@@ -1,0 +1,14 @@
+"""What a command came to."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The exit code of a command, and its results as JSON data, for --json; None where it wrote
+    them into a file, or has none."""
+
+    code: int = 0
+    summary: Mapping[str, Any] | None = None
