@@ -493,11 +493,14 @@ def test_init_writes_a_problem_that_every_command_reads(capsys):
     assert found.mpc.control_horizon == 5 and found.outputs[0].rho == 100
 
 
-@pytest.mark.parametrize("words", [["--help"], ["--version"], ["tune", "--help"], ["swep"]])
-def test_help_and_version_do_without_jax(words):
+@pytest.mark.parametrize(
+    "line",
+    ["--help", "--version", "swep", "sweep --help", "tune weights --wrong", "simulate --count 0"],
+)
+def test_help_version_and_wrong_options_do_without_jax(line):
     code = (
         "import sys; from jaxmpc.app import cli\n"
-        f"try: cli.main({words})\nexcept SystemExit: pass\n"
+        f"try: cli.main({line.split()})\nexcept SystemExit: pass\n"
         "print(sorted({'jax', 'mujoco', 'zarr', 'xarray', 'matplotlib'} & set(sys.modules)))"
     )
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
