@@ -98,3 +98,18 @@ def compiled():
     jax.monitoring.register_event_duration_secs_listener(note)
     yield found
     jax.monitoring.unregister_event_duration_listener(note)
+
+
+@pytest.fixture(autouse=True)
+def _no_empty_panel(monkeypatch):
+    """Every picture that a test saves, also by a command, has something in each panel."""
+    from matplotlib.figure import Figure
+    from panels import require_no_empty_panel
+
+    save = Figure.savefig
+
+    def checked(self, *args, **options):
+        require_no_empty_panel(self)
+        return save(self, *args, **options)
+
+    monkeypatch.setattr(Figure, "savefig", checked)

@@ -140,7 +140,8 @@ def test_pictures_in_another_format(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(matplotlib.rcParams, "savefig.format", "png")
     monkeypatch.setattr(init.Init, "run", lambda self: save(figure, path))
     figure, path = Figure(), tmp_path / "map.png"
-    figure.add_subplot().set_title("Ж", loc="left")
+    figure.add_subplot().plot([0, 1], [0, 1])
+    figure.axes[0].set_title("Ж", loc="left")
     for name, others in (("pdf", {".pdf"}), ("svg", {".svg"}), ("png", set())):
         assert cli.main(["init", "--format", name]) == 0
         assert {found.suffix for found in tmp_path.iterdir()} == {".png"} | others

@@ -6,13 +6,19 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from panels import require_no_empty_panel
 
-from jaxmpc.app.plots import plot_feasible_set, plot_recursion, plot_robot_map
+from jaxmpc.app.plots import plot_body, plot_feasible_set, plot_recursion, plot_robot_map
+from jaxmpc.app.plots.closed_loops import plot_before_after, plot_runs
+from jaxmpc.app.plots.tuning import plot_maps, plot_solver, plot_tuning
+from jaxmpc.closed_loop.simulation import Run
 from jaxmpc.recursion.counterexamples import Counterexample, SampledLoops
 from jaxmpc.recursion.proofs import Claim
 from jaxmpc.recursion.report import RecursionReport
+from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.sets.convex_sets import Box, Polytope
 from jaxmpc.systems.system import LinearSystem
+from jaxmpc.tuning.descent import Descent
 
 
 @dataclasses.dataclass(frozen=True)
@@ -227,3 +233,98 @@ def test_robot_map_says_in_words_what_became_of_each_state(claim):
     assert len(np.unique(image)) == len(counts) + 2 + bool(open_)
     assert ax.get_title(loc="left").startswith("pendulum: ") and "2 s" in ax.get_title(loc="left")
     assert (ax.get_xlabel(), ax.get_ylabel()) == rmap.axis_names
+
+
+def drawn_history(rng, steps, every, fail_share, zero):
+    """A descent as `jaxmpc tune weights` draws it: validation every so many steps, some steps
+    without a finite gradient."""
+    accepted = rng.uniform(size=steps) >= fail_share
+    measured = (np.arange(steps + 1) % every == 0) | (np.arange(steps + 1) == steps)
+    share = np.where(measured, 0.0 if zero else rng.uniform(size=steps + 1), np.nan)
+    return Descent(
+        theta=None, best=0, thetas=None, loss=np.where(accepted, rng.uniform(1, 9, steps), np.nan),
+        gradient_norm=np.where(accepted, rng.uniform(1, 9, steps), np.nan), accepted=accepted,
+        validation=np.where(measured, rng.uniform(1, 9, steps + 1), np.nan), numbers={},
+        validation_numbers={"unsolved": share, "violation": share}, seconds=0.0,
+        interrupted=False,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("steps", [0, 1, 2, 7, 60])
+@pytest.mark.parametrize("every", [1, 3])
+def test_no_panel_of_tuning_is_empty(steps, every):
+    """Whatever --updates, --tune and the run come to."""
+    rng = np.random.default_rng(steps)
+    for fail_share in (0.0, 0.5, 1.0):
+        for zero in (True, False):
+            for entries in (1, 3, 12):
+                trace = {"Q": {f"x{i}": rng.uniform(0.5, 2, steps + 1) for i in range(entries)}}
+                history = drawn_history(rng, steps, every, fail_share, zero)
+                figure = plot_tuning(history, trace, "title")
+                require_no_empty_panel(figure)
+                names = {ax.get_ylabel() for ax in figure.axes}
+                assert ("fraction in the validation loops [%]" in names) == (not zero)
+                assert ("weight relative to the start" in names) == (steps > 0)
+
+
+@pytest.mark.parametrize("residual", [1e-9, 1.0, np.inf, np.nan])
+@pytest.mark.parametrize("count", [1, 5])
+def test_no_panel_of_the_solver_is_empty(residual, count):
+    run = SimpleNamespace(
+        settings={"blocks": [("states", [0, 1, 2], 2), ("terminal", [3], 4), ("none", [], 0)]},
+        solver=SimpleNamespace(rho=np.full((3, 10), 0.1)),
+    )
+    before, after = np.full(count, residual), np.full(count, 1e-12)
+    figure = plot_solver(run, before, after, 1e-6)
+    require_no_empty_panel(figure)
+    labels = [text.get_text() for text in figure.axes[-1].get_legend().get_texts()]
+    assert labels[0].startswith("before: 100.0 %" if residual == 1e-9 else "before: 0.0 %")
+    assert labels[1].startswith("after: 100.0 %")
+
+
+def test_maps_without_area_are_drawn_as_points():
+    fmap = Map(square(11))
+    flat = SimpleNamespace(
+        x0s=fmap.x0s, label=fmap.label, mpc=fmap.mpc, axis_names=fmap.axis_names,
+        inner=lambda: None, volume_bounds=lambda: (0.0, 0.0),
+    )  # fmt: skip
+    figure = plot_maps(flat, flat)
+    require_no_empty_panel(figure)
+    assert "25 feasible states, without area" in texts(figure.axes[0])[0]
+
+
+def test_what_has_nothing_to_draw_is_refused():
+    report = recursion_report(square(3), worst=False)
+    loops = SimpleNamespace(x0s=np.zeros((0, 2)), lost_at=np.zeros(0), label=np.zeros(0), steps=9)
+    with pytest.raises(ValueError, match="holds nothing to draw"):
+        plot_recursion(dataclasses.replace(report, feasible_set=None, loops=loops))
+    fmap = SimpleNamespace(axis_names=("a", "b", "c"), inner=lambda: None, outer=lambda: None)
+    with pytest.raises(ValueError, match="has no bounded body to draw"):
+        plot_body(fmap)
+
+
+@pytest.mark.parametrize("finite", [0, 1, 2, 9])
+def test_no_panel_of_loops_that_end_is_empty(finite):
+    """Of states and inputs that are finite for so many samples."""
+    B, T = 3, 8
+    states, inputs, zeros = np.zeros((B, T + 1, 2)), np.zeros((B, T, 1)), np.zeros((B, T))
+    states[:, finite:], inputs[:, finite:] = np.nan, np.nan
+    plant = LinearPlant(
+        LinearSystem(np.eye(2), np.ones((2, 1)), dt=0.1), Box([-1, -1], [1, 1]), Box([-1], [1])
+    )
+    run = Run(states, inputs, zeros, zeros, zeros, zeros, zeros, zeros)
+    require_no_empty_panel(plot_runs(run, plant))
+    require_no_empty_panel(plot_before_after(run, run, plant))
+
+
+def test_an_empty_panel_is_found():
+    figure = Figure()
+    ax = figure.add_subplot()
+    ax.axhline(1.0)
+    with pytest.raises(AssertionError, match="is empty"):
+        require_no_empty_panel(figure)
+    ax.plot([0.0, np.nan, 1.0], [0.0, 1.0, 1.0])
+    with pytest.raises(AssertionError, match="is empty"):
+        require_no_empty_panel(figure)
+    ax.plot([0.0], [0.0], "o")
+    require_no_empty_panel(figure)

@@ -67,8 +67,11 @@ class Recursion(RecursionOptions):
             from jaxmpc.app.plots.maps import draw_recursion
             from jaxmpc.app.plots.style import save
 
-            save(draw_recursion(report), self.output / "recursion.png", config.name)
-            files.append("recursion.png")
+            try:
+                save(draw_recursion(report), self.output / "recursion.png", config.name)
+                files.append("recursion.png")
+            except ValueError as error:
+                rows.append(("picture", f"none: {error}"))
         print(report)
         rows.append(("total", f"{time.perf_counter() - begun:.2f} s with set-up and files"))
         rows.append(("files", " ".join(str(self.output / name) for name in files)))

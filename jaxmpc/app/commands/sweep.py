@@ -142,18 +142,22 @@ def run_row(found: StoredMap) -> tuple[str, str]:
 def conclude(found: StoredMap, config: configs.Config, output: Path, start: float) -> None:
     """Write the picture of two or three states and the summary, and print the table."""
     axes = found.problem.view.axes
+    picture = f"none: map.png shows two or three axes, and this map has {len(axes)}"
     files = [str(found.store.path), str(output / "summary.json")]
     if len(axes) in (2, 3):
         from jaxmpc.app.plots.maps import plot_body, plot_feasible_set
         from jaxmpc.app.plots.style import save
 
         figure: Any = None
-        if len(axes) == 3:
-            figure = plot_body(found.bounds)
-        else:
-            figure = plot_feasible_set(found.bounds, picture=found.picture()).figure
-        save(figure, output / "map.png", config.name)
-        files.append(str(output / "map.png"))
+        try:
+            if len(axes) == 3:
+                figure = plot_body(found.bounds)
+            else:
+                figure = plot_feasible_set(found.bounds, picture=found.picture()).figure
+            save(figure, output / "map.png", config.name)
+            files.append(str(output / "map.png"))
+        except ValueError as error:
+            picture = f"none: {error}"
     low, high = found.bounds.volume_bounds()
     if low > high * (1 + 1e-9):
         what = f"its inner bound {low:.9g} exceeds its outer bound {high:.9g}"
@@ -184,9 +188,8 @@ def conclude(found: StoredMap, config: configs.Config, output: Path, start: floa
         ("total", f"{seconds:.2f} s with bounds and files"),
         ("files", " ".join(files)),
     ]
-    if len(axes) not in (2, 3):
-        what = f"none: map.png shows two or three axes, and this map has {len(axes)}"
-        rows.append(("picture", what))
+    if str(output / "map.png") not in files:
+        rows.append(("picture", picture))
     print_table(rows, 12)
 
 

@@ -74,7 +74,8 @@ class TuneWeightsOptions:
       tuned.toml        The whole problem with the tuned weights: for --config of jaxmpc sweep,
                         recursion, info, tune; of a robot for jaxmpc simulate --robot NAME --config.
       tuning.json       Options; loss, gradient norm, counts and weights of every step; versions.
-      tuning.png        The same as curves. Red crosses: steps rejected because not finite.
+      tuning.png        The same as curves, counts where any is above 0. Red crosses: steps
+                        rejected because not finite.
       before_after.png  Some validation loops with the weights before and after.
       maps.png          The feasible set before and after; for two states, with tightening tuned.
       checkpoint.npz    The state of the run after every step, for --resume.

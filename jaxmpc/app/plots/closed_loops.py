@@ -49,9 +49,9 @@ def plot_runs(
     run: of `simulate` or `simulate_many`, of a Robot or LinearPlant. Limits are lines, what lies
     outside is grey. Orange: the plan was solved and needs slack, hence exceeds soft limits
     somewhere on its horizon (fallback). Purple: the plan was not solved. Red: limits exceeded by
-    more than 1e-6 (of the limit, if that is above 1). reference (n,), input_reference (m,):
-    set-points to draw. robots: which of the batch to draw, 24 at most by default; the title
-    counts all. Raises ValueError for robots that are not there.
+    more than 1e-6 (of the limit, if that is above 1). Cross: the next value is not finite.
+    reference (n,), input_reference (m,): set-points to draw. robots: which of the batch to draw, 24
+    at most by default; the title counts all. Raises ValueError for robots that are not there.
     """
     run = run.on_host()
     inputs, plans = np.asarray(run.inputs), plan_outcomes(run)
@@ -122,6 +122,7 @@ def plot_before_after(
             lines = np.concatenate([lines, lines[-1:]]) if kind else lines
             style: dict[str, Any] = {"drawstyle": "steps-post"} if kind else {}
             ax.plot(time, lines, color=colour, lw=width, alpha=0.9, **style)
+            _mark_ends(ax, time, lines, colour)
         draw_limits(ax, plant, kind, i, (reference, input_reference)[kind])
     handles: list[Any] = [
         Line2D([], [], color=BEFORE, lw=2.2, label="before"),
@@ -247,8 +248,19 @@ def _draw_lines(
         part[1:] |= plans
         if part.any():
             ax.plot(time, np.where(part, values, np.nan), color=colour, lw=0.9, **style)
+    _mark_ends(ax, time, values, RUN)
     k, robot = np.nonzero(broken)
     ax.plot(time[k], values[k, robot], ".", color=BROKEN, ms=2, zorder=4)
+
+
+def _mark_ends(ax: Axes, time: np.ndarray, values: np.ndarray, colour: str) -> None:
+    """Mark by a cross where a line of values (samples, loops) ends since the next is not finite."""
+    finite = np.isfinite(values)
+    if not finite.any():
+        style: Style = {"transform": ax.transAxes, "ha": "center", "va": "center", "fontsize": 7}
+        ax.text(0.5, 0.5, "not finite", **style)
+    k, loop = np.nonzero(finite[:-1] & ~finite[1:])
+    ax.plot(time[k], values[k, loop], "x", color=colour, ms=5, zorder=4)
 
 
 def draw_limits(ax: Axes, plant: Any, kind: int, i: int, reference: Any) -> None:

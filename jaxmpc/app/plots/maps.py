@@ -70,17 +70,20 @@ def plot_body(fmap: FeasibleSetMap) -> Figure:
     """Draw the feasible set of three states: its inner bound as a body in space, and inner and
     outer bound as they are projected onto each pair of states.
 
-    fmap: refined (`FeasibleSetMap.refine`), which proves the bounds. Raises ValueError for a map
-    not of three states.
+    fmap: refined (`FeasibleSetMap.refine`), which proves the bounds. Where there is no inner bound
+    the body is the outer one. Raises ValueError for a map not of three states, and where neither
+    bound is a bounded body.
     """
     names = fmap.axis_names
     if len(names) != 3:
         fail("fmap", f"maps {len(names)} states", "A body needs 3: choose `axes`")
+    inner, outer = _corners(fmap.inner), _corners(fmap.outer)
+    if not len(inner) and not len(outer):
+        fail("fmap", "has no bounded body to draw", "Refine it, or map a set with an interior")
     figure = Figure(figsize=(9.6, 8.0), layout="constrained")
     space = figure.add_subplot(2, 2, 1, projection="3d")
-    inner, outer = _corners(fmap.inner), _corners(fmap.outer)
-    if len(inner):
-        plot(fmap.inner(), ax=space, color=INNER, alpha=0.35)
+    body, colour = (fmap.inner(), INNER) if len(inner) else (fmap.outer(), OUTER)
+    plot(body, ax=space, color=colour, alpha=0.35)
     for axis, name in zip("xyz", names, strict=True):
         getattr(space, f"set_{axis}label")(name, fontsize=9)
     space.set_title(_map_title(fmap), loc="left", fontsize=11)
@@ -241,16 +244,18 @@ def plot_recursion(
     enlarge: show the neighbourhood of the counterexample, with X_N filled and without samples.
 
     X_N is filled also where there are no samples. Without `ax` a new figure is made. Raises
-    ValueError for other than two states, and for enlarge without a counterexample.
+    ValueError for other than two states, for enlarge without a counterexample, and where there is
+    neither set, sample nor counterexample.
     """
     if report.loops.x0s.shape[1] != 2:
         fail("report", f"is of {report.loops.x0s.shape[1]} states", "A plot needs 2")
-    worst = report.counterexample
+    worst, corners = report.counterexample, ring(lambda: report.feasible_set)
+    if worst is None and not len(corners) and not len(report.loops.x0s):
+        fail("report", "holds nothing to draw", "Give more seconds, or states to follow")
     if enlarge and worst is None:
         fail("enlarge", "without a counterexample there is nothing to enlarge", "Leave it out")
     ax = new_axes() if ax is None else ax
     handles: list[Artist] = []
-    corners = ring(lambda: report.feasible_set)
     if enlarge or not len(report.loops.x0s):
         ax.fill(*corners.T, color=FEASIBLE, zorder=0)
     else:

@@ -32,68 +32,93 @@ DASHES: tuple[Any, ...] = ("-", (0, (4, 2)), (0, (1, 1.5)), (0, (5, 1, 1, 1)))
 def plot_tuning(
     history: Descent, weights: Mapping[str, Mapping[str, np.ndarray]], title: str = ""
 ) -> Figure:
-    """Draw a `Descent` of weights in four panels over its T steps.
+    """Draw a `Descent` of weights over its T steps, in a panel each for what there is to show.
 
     Loss of the steps and of the validation loops, each relative to its first value where that is
     positive, the best of them marked; norm of the gradient; weights relative to the start;
-    fractions of the validation plans and loops where something went wrong. Red crosses: rejected
-    steps.
+    fractions of the validation plans and loops where something went wrong, if anything did. Red
+    crosses: rejected steps.
 
     history: of a `TuningRun`. weights: group → entry → positive values (T+1,).
     """
-    figure = Figure(figsize=(11, 6.6), layout="constrained")
-    ((top, norm), (ratio, counts)) = figure.subplots(2, 2)
-    every, steps, best = np.arange(history.steps + 1), np.arange(history.steps), history.best
-    loss, validation = history.loss, history.validation
-    # Training and validation loops differ, so only relative changes are comparable.
-    relative = validation[0] > 0 and len(loss) > 0 and loss[0] > 0
-    if relative:
-        loss, validation = loss / loss[0], validation / validation[0]
-    top.plot(steps, loss, color=EDGE, lw=1, label="training loops of the step")
-    top.plot(every, validation, color=AFTER, lw=1.6, label="validation loops")
-    label = f"best: {history.validation[best]:.6g} at step {best}"
-    top.plot(best, validation[best], "o", color=BEST, ms=6, label=label, zorder=4)
-    norm.plot(steps, history.gradient_norm, color=AFTER, lw=1.2)
+    every, steps = np.arange(history.steps + 1), np.arange(history.steps)
+    counts = [
+        (label, 100 * values, {"color": colour, "ls": dashes, "lw": 1.4})
+        for key, label, colour, dashes in FRACTIONS
+        if (values := history.validation_numbers.get(key)) is not None
+    ]
+    panels = ["loss"]
+    if np.isfinite(history.gradient_norm).any():
+        panels.append("norm")
+    if history.steps and any(weights.values()):
+        panels.append("weights")
+    if any(np.nanmax(values, initial=0.0) > 0 for _, values, _ in counts):
+        panels.append("counts")
+    rows, columns = {1: (1, 1), 2: (1, 2), 3: (1, 3), 4: (2, 2)}[len(panels)]
+    size = (5.5 * max(columns, 1.4), 3.3 * max(rows, 1.2))
+    figure = Figure(figsize=size, layout="constrained")
+    axes = dict(zip(panels, figure.subplots(rows, columns, squeeze=False).flat, strict=True))
+    names = {"norm": "norm of the gradient", "weights": "weight relative to the start"}
+    names |= {"loss": _draw_loss(axes["loss"], history)}
+    names |= {"counts": "fraction in the validation loops [%]"}
+    if "norm" in axes:
+        _line(axes["norm"], steps, history.gradient_norm, color=AFTER, lw=1.2)
+        _scale(axes["norm"], history.gradient_norm)
     rejected = steps[~history.accepted]
-    for ax in (top, norm):
-        if len(rejected):
-            ax.plot(
+    for name in ("loss", "norm"):
+        if len(rejected) and name in axes:
+            axes[name].plot(
                 rejected,
                 np.full(len(rejected), 0.04),
                 "x",
                 color=REJECTED,
                 ms=5,
                 ls="",
-                transform=ax.get_xaxis_transform(),
+                transform=axes[name].get_xaxis_transform(),
                 label=f"rejected steps ({len(rejected)})",
             )
-    _scale(top, loss, validation)
-    _scale(norm, history.gradient_norm)
-    _draw_weights(ratio, every, weights)
-    highest = 0.0
-    for key, label, colour, dashes in FRACTIONS:
-        values = history.validation_numbers.get(key)
-        if values is not None:
-            counts.plot(every, 100 * values, color=colour, ls=dashes, lw=1.4, label=label)
-            highest = max(highest, 100 * float(np.nanmax(values, initial=0.0)))
-    highest = max(highest, 1.0)
-    counts.set_ylim(-0.03 * highest, 1.35 * highest if highest < 75 else 105)
-    for ax, name in (
-        (top, "loss relative to the start" if relative else "loss"),
-        (norm, "norm of the gradient"),
-        (ratio, "weight relative to the start"),
-        (counts, "fraction in the validation loops [%]"),
-    ):
+    if "weights" in axes:
+        _draw_weights(axes["weights"], every, weights)
+    if "counts" in axes:
+        for label, values, style in counts:
+            _line(axes["counts"], every, values, label=label, **style)
+        highest = max(1.0, *(float(np.nanmax(values)) for _, values, _ in counts))
+        top = 1.35 * highest if highest < 75 else 105
+        axes["counts"].set_ylim(-0.03 * highest, top)
+    for name, ax in axes.items():
         ax.set_xlabel("step")
-        ax.set_ylabel(name)
+        ax.set_ylabel(names[name])
         ax.set_xlim(-0.02 * max(1, history.steps), 1.02 * max(1, history.steps))
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
         ax.grid(**GRID)
         ax.set_axisbelow(True)
-        if ax is not ratio and (ax is not norm or len(rejected)):
+        if name in ("loss", "counts") or (name == "norm" and len(rejected)):
             ax.legend(fontsize=8, frameon=False)
     figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     return figure
+
+
+def _draw_loss(ax: Axes, history: Descent) -> str:
+    """Draw the losses of steps and validation loops, and return what they are."""
+    every, steps, best = np.arange(history.steps + 1), np.arange(history.steps), history.best
+    loss, validation = history.loss, history.validation
+    # Training and validation loops differ, so only relative changes are comparable.
+    relative = validation[0] > 0 and len(loss) > 0 and loss[0] > 0
+    if relative:
+        loss, validation = loss / loss[0], validation / validation[0]
+    if len(loss):
+        _line(ax, steps, loss, color=EDGE, lw=1, label="training loops of the step")
+        _line(ax, every, validation, color=AFTER, lw=1.6, label="validation loops")
+    label = f"best: {history.validation[best]:.6g} at step {best}"
+    ax.plot(best, validation[best], "o", color=BEST, ms=6, label=label, zorder=4)
+    _scale(ax, loss, validation)
+    return "loss relative to the start" if relative else "loss"
+
+
+def _line(ax: Axes, x: np.ndarray, y: np.ndarray, **style: Any) -> None:
+    """Draw a line through the finite values, as points where they are few."""
+    x, y = x[np.isfinite(y)], y[np.isfinite(y)]
+    ax.plot(x, y, marker="." if len(x) < 5 else None, **style)
 
 
 def _scale(ax: Axes, *columns: np.ndarray) -> None:
@@ -130,7 +155,8 @@ def _draw_weights(
         for name, values in entries.items():
             colour = colours[(i if count <= NAMED else g) % len(colours)]
             ratios.append(values / values[0])
-            ax.plot(steps, ratios[-1], color=colour, lw=1.3, alpha=1 if count <= NAMED else 0.6)
+            alpha = 1 if count <= NAMED else 0.6
+            _line(ax, steps, ratios[-1], color=colour, lw=1.3, alpha=alpha)
             if count <= NAMED:
                 handles.append(Line2D([], [], color=colour, label=f"{group} {name}".strip()))
             i += 1
@@ -168,6 +194,10 @@ def plot_maps(before: FeasibleSetMap, after: FeasibleSetMap) -> Figure:
         if len(corners):
             label = f"{name}: area {low:.5g} to {high:.5g}"
             ax.plot(*corners.T, color=colour, ls=dashes, lw=1.6, label=label)
+        else:
+            points = fmap.x0s[fmap.label == 1]
+            label = f"{name}: {len(points):,} feasible states, without area"
+            ax.plot(*points.T, ".", color=colour, label=label)
     ax.set_xlabel(before.axis_names[0])
     ax.set_ylabel(before.axis_names[1])
     title = f"Feasible initial states, horizon N = {before.mpc.horizon}, inner bounds"
@@ -225,15 +255,18 @@ def plot_solver(
         if widest > 1
     ]
     figure.legend(handles=stages, loc="outside lower left", ncols=8, fontsize=8, frameon=False)
-    last = axes[-1]
+    last, count = axes[-1], max(len(before), 1)
+    both = np.concatenate([before, after, [eps]])
+    both = np.maximum(both[np.isfinite(both)], 1e-17)
+    left, right = 0.5 * both.min(), 2 * both.max()
     for values, name, colour in ((before, "before", BEFORE), (after, "after", AFTER)):
-        # What is not finite stays unsolved at the right end.
-        values = np.sort(np.where(np.isfinite(values), values, np.inf))
-        fraction = 100 * np.arange(1, len(values) + 1) / len(values)
-        solved = 100 * np.mean(values <= eps)
+        # What is not finite stays unsolved, at the right end.
+        values = np.sort(values[np.isfinite(values)])
+        fraction = 100 * np.arange(1, len(values) + 1) / count
+        solved = 100 * np.count_nonzero(values <= eps) / count
         last.step(
-            np.maximum(values, 1e-17),
-            fraction,
+            np.concatenate([[left], np.maximum(values, left), [right]]),
+            np.concatenate([[0.0], fraction, fraction[-1:] if len(fraction) else [0.0]]),
             where="post",
             color=colour,
             lw=1.6,
