@@ -26,6 +26,7 @@ from fractions import Fraction
 import jax
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.colors import ListedColormap
 
 import jaxmpc as jm
 
@@ -85,8 +86,12 @@ assert low <= 1489 / 125 <= high and (high - low) / high < 1e-6
 def draw(label, title, outline=True):
     """Draw labels on the grid, and the outline of the feasible set."""
     figure, axis = plt.subplots(figsize=(7, 3.6), layout="constrained")
-    for value, color, name in ((-1, "#dddcd8", "infeasible"), (1, "#9fcbe6", "feasible")):
-        axis.plot(*x0s[label == value].T, "s", ms=3, color=color, label=name)
+    colors = {"infeasible": "#dddcd8", "feasible": "#9fcbe6"}
+    q, dq = (np.unique(column) for column in x0s.T)
+    cells = label.reshape(shape).T
+    axis.pcolormesh(q, dq, cells, cmap=ListedColormap([*colors.values()]), vmin=-1, vmax=1)
+    for name, color in colors.items():
+        axis.plot([], [], "s", color=color, label=name)
     if outline:
         corners = fmap.outer().vertices()
         corners = np.vstack([corners, corners[:1]])

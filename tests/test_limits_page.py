@@ -10,14 +10,16 @@ import scipy.sparse
 
 import jaxmpc as jm
 from jaxmpc.qp.problem import dense
+from jaxmpc.workflow.offline_checks import theorems
 
 TEXT = " ".join((Path(__file__).resolve().parents[1] / "docs" / "limits.md").read_text().split())
 DOUBLE = jm.LinearSystem([[1.0, 1.0], [0.0, 1.0]], [0.5, 1.0])
 
 
 def problem(**changes):
-    given = dict(horizon=3, states=jm.Box([-5, -5], [5, 5]), inputs=jm.Box(-1, 1))
-    return jm.MPC(DOUBLE, [1.0, 1.0], 1.0, **(given | changes))
+    given = dict(system=DOUBLE, horizon=3, states=jm.Box([-5, -5], [5, 5]), inputs=jm.Box(-1, 1))
+    given |= changes
+    return jm.MPC(given.pop("system"), [1.0, 1.0], 1.0, **given)
 
 
 def says(sentence):
@@ -47,6 +49,43 @@ def test_matrices_are_dense():
     says("P and A are dense.")
     made = dense(scipy.sparse.eye_array(2))
     assert type(made) is np.ndarray and np.array_equal(made, np.eye(2))
+
+
+W = jm.Box([-0.1, -0.1], [0.1, 0.1])
+STEPS = jm.LinearSystem(np.stack([DOUBLE.A] * 3), np.stack([DOUBLE.B] * 3))
+REFUSED = {
+    "`offline_report` says so where a problem has outputs, rates or blocked moves": [
+        lambda: theorems(problem(input_rate_limit=0.5)),
+        lambda: theorems(problem(control_horizon=2)),
+        lambda: theorems(problem(outputs=jm.Outputs([[1.0, 0.0]], upper=4.0))),
+    ],
+    "Explicit laws, `solve_stagewise` and `OffsetFreeController` are those of `policy=": [
+        lambda: jm.explicit.critical_regions(problem(disturbance=W, policy="affine")),
+        lambda: jm.explicit.critical_regions(problem(disturbance=W, policy="tube")),
+    ],
+    "Plans under tubes and affine policies take no soft rows, control horizons or rate limits": [
+        lambda: jm.solve(problem(disturbance=W, policy="affine", control_horizon=2), [0, 0]),
+        lambda: jm.solve(problem(disturbance=W, policy="tube", input_rate_limit=0.5), [0, 0]),
+        lambda: jm.solve(jm.soften(problem(disturbance=W, policy="affine"), 10.0), [0, 0]),
+    ],
+    "Terminal sets are polytopes": [
+        lambda: problem(disturbance=W, terminal_set=jm.Ellipsoid(np.eye(2), 1.0)).validate(),
+    ],
+    "steady states, observers and disturbances refuse it": [
+        lambda: jm.recursive_feasibility(problem(system=STEPS)),
+        lambda: jm.workflow.offline_report(problem(system=STEPS)),
+        lambda: problem(system=STEPS, disturbance=W).validate(),
+    ],
+}
+
+
+@pytest.mark.parametrize("sentence", REFUSED, ids=lambda sentence: sentence[:40])
+def test_what_is_not_taken_is_refused(sentence):
+    """By an error that names the argument."""
+    says(sentence)
+    for call in REFUSED[sentence]:
+        with pytest.raises(ValueError, match=r"^[\w.]+: "):
+            call()
 
 
 def test_stagewise_takes_no_disturbance():

@@ -195,7 +195,7 @@ class TestSolution:
 
     @pytest.mark.slow
     def test_real_time_iterations_come_to_the_solution(self, x64):
-        """One QP a call from the last plan, for the same state: Gauss and Newton's method."""
+        """One QP a call from the last plan, for the same state: the Gauss-Newton method."""
         problem = around()
         plan = None
         for _ in range(60):
@@ -378,7 +378,7 @@ def two_joints(x, u):
 
 @pytest.mark.slow
 def test_one_qp_a_sample_comes_to_rest_at_a_target_out_of_reach(x64):
-    """The arm ends stretched towards the target, 1.5 m away, where Gauss and Newton's full steps
+    """The arm ends stretched towards the target, 1.5 m away, where full Gauss-Newton steps
     swing from limit to limit."""
     system = jm.LinearSystem(np.eye(4), np.zeros((4, 2)))
     limits, slow = jm.Box([-1.0, -1.0], [1.0, 1.0]), [0, 0, 0.1, 0.1]

@@ -1,7 +1,7 @@
 """MPC of a nonlinear model with costs and limits on functions of its state, and its expansion.
 
 About a trajectory x (N+1, n), u (N, m) the problem becomes one of `stages.py`: the model affine,
-functions affine, the cost of weighed functions |g − target|²_W by Gauss and Newton: gradient
+functions affine, the cost of weighed functions |g − target|²_W by Gauss-Newton: gradient
 2 G'W(g − target), Hessian 2 G'WG with G the Jacobian of g, and a diagonal that is at least the
 curvature left out (`majorant`). All quadratic terms stand about the trajectory itself, so the
 gradient there is that of the true cost.
@@ -360,10 +360,10 @@ def majorant(
     problem: NonlinearMPC, task: Task, x: Array, u: Array, error: Array
 ) -> tuple[Array, Array]:
     """Return diagonal weights of states (steps, n, n) and inputs (steps, m, m) that are at least
-    the curvature which Gauss and Newton leave out, ½ Σ error_i ∇²g_i, error = 2 W (g − target).
+    the curvature which Gauss-Newton leaves out, ½ Σ error_i ∇²g_i, error = 2 W (g − target).
 
     A symmetric matrix is at most the diagonal of its absolute row sums. Where the target is met
-    they are zero. Where it is out of reach, full steps of Gauss and Newton alone may swing for
+    they are zero. Where it is out of reach, full Gauss-Newton steps alone may swing for
     ever; with these weights the expansion bounds the task's cost from above, next to the
     trajectory.
     """
@@ -388,7 +388,7 @@ def task_layout(problem: NonlinearMPC) -> tuple:
 def curved(
     s: Stages, base: Stages, problem: NonlinearMPC, x: Array, u: Array, costates: Array, y: Array
 ) -> Stages:
-    """Return the expansion s with the Hessian of the Lagrangian in place of Gauss and Newton's.
+    """Return the expansion s with the Hessian of the Lagrangian in place of the Gauss-Newton one.
 
     base: `Stages` of the MPC; costates λ (N+1, n) of x_0 … x_N; y (rows,) of s.
     """
