@@ -137,6 +137,11 @@ def total(a: Interval, axis: int | tuple[int, ...]) -> Interval:
     return Interval(lower - off * sizes[0], upper + off * sizes[1])
 
 
+def dot(a: Interval, b: Interval) -> Interval:
+    """Return Σ_i a_i b_i over the last axis."""
+    return total(multiply(a, b), -1)
+
+
 def matrix_product(a: Interval, b: Interval) -> Interval:
     """Return the matrix a b (…, i, k) of a (…, i, j) and b (…, j, k)."""
     return total(multiply(a[..., :, :, None], b[..., None, :, :]), -2)

@@ -1,19 +1,15 @@
 """Enclosures of a function of JAX and its first two derivatives over boxes, by its own program.
 
-The traced program is run operation by operation, in NumPy, on polynomials of Taylor of second order
+The traced program is run in NumPy (`traced_programs.py`), on polynomials of Taylor of second order
 in place of numbers: value, gradient and Hessian, each an interval that holds them on the whole box.
-Operations on constants are done once, in float64.
 """
 
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import jax
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
 
 from jaxmpc.checks import fail
-from jaxmpc.qp.jax_transformations import called_jaxpr
 from jaxmpc.robots.intervals import (
     Interval,
     add,
@@ -30,6 +26,7 @@ from jaxmpc.robots.intervals import (
     subtract,
     total,
 )
+from jaxmpc.robots.traced_programs import Move, TracedProgram, for_product
 
 
 class Taylor:
@@ -80,6 +77,10 @@ class Taylor:
     def mapped(self, function: Callable[[np.ndarray], np.ndarray]) -> "Taylor":
         """Return what a function that only moves entries makes of it."""
         return Taylor(self.variables, self.of.mapped(function), self.steps)
+
+    def entries(self, move: Move) -> "Taylor":
+        """Return what an operation of a program that only moves entries makes of it."""
+        return self.mapped(lambda ends: move(ends, 2))
 
     def spread(self, axes: int) -> "Taylor":
         """Return a single function (shape ()) with this many axes; others as they are."""
@@ -189,165 +190,6 @@ def _aligned(values: Sequence[Taylor]) -> list[Taylor]:
     return [v.spread(axes).on(every) for v in values]
 
 
-class TaylorProgram:
-    """A function of JAX as a program on boxes.
-
-    function: of arrays of float64 of the given sizes, to a pytree of arrays. `program(box,
-    points)`, an Interval (boxes, d) in all d numbers of its arguments and a point (boxes, d) in
-    each, returns the leaves of the result as `Taylor`s, or as arrays where they are constant.
-
-    Raises ValueError, naming the operation, where the function has one without a rule here, such as
-    loops, branches and maxima. A call raises ZeroDivisionError where an enclosure that is divided
-    by holds 0 (take smaller boxes).
-    """
-
-    def __init__(self, function: Callable, sizes: Sequence[int]) -> None:
-        self.sizes = tuple(sizes)
-        with jax.enable_x64(True):
-            self.traced: ClosedJaxpr = jax.make_jaxpr(function)(*(np.zeros(k) for k in sizes))
-        # What operations on constants return, and where others move entries, each by its place.
-        self.known: dict[tuple[int, ...], list] = {}
-
-    def __call__(self, box: Interval, points: np.ndarray) -> list:
-        starts = np.cumsum([0, *self.sizes])
-        args = [
-            variables(box, points, range(start, start + size))
-            for start, size in zip(starts, self.sizes, strict=False)
-        ]
-        with guarded():
-            return self._evaluated(self.traced, args, ())
-
-    def _evaluated(self, closed: ClosedJaxpr, args: Sequence, place: tuple[int, ...]) -> list:
-        jaxpr = closed.jaxpr
-        values = dict(zip(jaxpr.constvars, map(np.asarray, closed.consts), strict=True))
-        values.update(zip(jaxpr.invars, args, strict=True))
-        read = lambda v: np.asarray(v.val) if isinstance(v, Literal) else values[v]
-        for number, eqn in enumerate(jaxpr.eqns):
-            here, given = (*place, number), [read(v) for v in eqn.invars]
-            moving, inner = any(isinstance(v, Taylor) for v in given), called_jaxpr(eqn)
-            if here in self.known and not moving:
-                made = self.known[here]
-            elif inner is not None:
-                made = self._evaluated(inner, given, here)
-            elif eqn.primitive.name in ALIKE:
-                made = given
-            elif moving:
-                made = self._moving(jaxpr, eqn, given, here)
-            else:
-                made = self._still(jaxpr, eqn, given)
-            if not moving:
-                self.known[here] = made
-            values.update(zip(eqn.outvars, made, strict=True))
-        return [read(v) for v in jaxpr.outvars]
-
-    def _still(self, jaxpr: Jaxpr, eqn: Any, given: Sequence[np.ndarray]) -> list:
-        """Return what an operation on constants returns."""
-        name = eqn.primitive.name
-        if name in SHAPES:
-            return [SHAPES[name](given[0], 0, **eqn.params)]
-        if name in ON_CONSTANTS:
-            return [ON_CONSTANTS[name](*given).astype(eqn.outvars[0].aval.dtype)]
-        return _alone(jaxpr, eqn, given)
-
-    def _moving(self, jaxpr: Jaxpr, eqn: Any, given: Sequence, place: tuple[int, ...]) -> list:
-        """Return what an operation on functions returns."""
-        name = eqn.primitive.name
-        if name in SHAPES:
-            return [given[0].mapped(lambda ends: SHAPES[name](ends, 2, **eqn.params))]
-        if name in RULES:
-            return [RULES[name](*given, **eqn.params)]
-        if name in MOVES:
-            return self._moved(jaxpr, eqn, given, place)
-        problem = f"its program has the operation {name}, whose range over a box is not known here"
-        fail("robot", problem, "Take rigid bodies with motors: no contacts, tendons or loops")
-
-    def _moved(self, jaxpr: Jaxpr, eqn: Any, given: Sequence, place: tuple[int, ...]) -> list:
-        """Return the entries that an operation takes from its operands: found by running it on
-        their numbers."""
-        real = [np.issubdtype(v.aval.dtype, np.floating) for v in eqn.invars]
-        shapes = [v.aval.shape for v in eqn.invars]
-        if place not in self.known:
-            count, numbered = 0, []
-            for v, shape, is_real in zip(given, shapes, real, strict=True):
-                size = int(np.prod(shape)) if is_real else 0
-                ids = np.arange(count, count + size, dtype=float)
-                numbered.append(ids.reshape(shape) if is_real else v)
-                count += size
-            made = _alone(jaxpr, eqn, numbered)
-            self.known[place] = [ids.astype(int) for ids in made]
-        operands = [v for v, is_real in zip(given, real, strict=True) if is_real]
-        sizes = np.array([np.prod(v.shape, dtype=int) for v in operands])
-        still = np.repeat([not isinstance(v, Taylor) for v in operands], sizes)
-        like = next(v for v in operands if isinstance(v, Taylor))
-        parts = _aligned([v if isinstance(v, Taylor) else _constant(v, like) for v in operands])
-        flat = [part.of.mapped(lambda ends: ends.reshape(*ends.shape[:2], -1)) for part in parts]
-        lower, upper = (
-            np.concatenate([getattr(of, end) for of in flat], axis=-1) for end in ("lower", "upper")
-        )
-        joined = Interval(lower, upper)
-        return [
-            joined.lower[0, 0, ids]
-            if still[ids].all()
-            else Taylor(parts[0].variables, joined[..., ids], like.steps)
-            for ids in self.known[place]
-        ]
-
-
-def _alone(jaxpr: Jaxpr, eqn: Any, given: Sequence) -> list[np.ndarray]:
-    """Return what one operation returns for these operands."""
-    free = {v: x for v, x in zip(eqn.invars, given, strict=True) if not isinstance(v, Literal)}
-    one = jaxpr.replace(constvars=[], invars=list(free), outvars=list(eqn.outvars), eqns=[eqn])
-    with jax.enable_x64(True):
-        return [np.asarray(v) for v in jaxpr_as_fun(ClosedJaxpr(one, ()))(*free.values())]
-
-
-# Operations that return their operands.
-ALIKE = {"optimization_barrier", "copy", "copy_p", "stop_gradient", "device_put", "reshard"}
-
-
-def _sliced(
-    x: np.ndarray, lead: int, start_indices: Any, limit_indices: Any, strides: Any
-) -> np.ndarray:
-    steps = strides or (1,) * len(start_indices)
-    parts = map(slice, start_indices, limit_indices, steps)
-    return x[(slice(None),) * lead + tuple(parts)]
-
-
-def _broadcast(
-    x: np.ndarray, lead: int, shape: Any, broadcast_dimensions: Any, **_: Any
-) -> np.ndarray:
-    sizes = [1] * len(shape)
-    for size, axis in zip(x.shape[lead:], broadcast_dimensions, strict=True):
-        sizes[axis] = size
-    return np.broadcast_to(x.reshape(x.shape[:lead] + tuple(sizes)), x.shape[:lead] + tuple(shape))
-
-
-def _transposed(x: np.ndarray, lead: int, permutation: Any) -> np.ndarray:
-    return np.transpose(x, (*range(lead), *(lead + i for i in permutation)))
-
-
-# Operations on shapes; `lead` axes stand before those of the program.
-SHAPES: dict[str, Callable[..., np.ndarray]] = {
-    "slice": _sliced,
-    "broadcast_in_dim": _broadcast,
-    "transpose": _transposed,
-    "squeeze": lambda x, lead, dimensions, **_: np.squeeze(x, tuple(lead + i for i in dimensions)),
-    "reshape": lambda x, lead, new_sizes, **_: x.reshape(x.shape[:lead] + tuple(new_sizes)),
-}
-# Operations that take entries from their operands, which indices and conditions say.
-MOVES = {
-    *("concatenate", "gather", "scatter", "select_n", "pad", "split", "stack", "unstack"),
-    *("dynamic_slice", "dynamic_update_slice", "rev"),
-}
-# Operations on constants; all others are done by JAX, which compiles each.
-ON_CONSTANTS: dict[str, Callable[..., np.ndarray]] = {
-    **{"add": np.add, "sub": np.subtract, "mul": np.multiply, "neg": np.negative},
-    **{"eq": np.equal, "ne": np.not_equal, "lt": np.less, "le": np.less_equal},
-    **{"gt": np.greater, "ge": np.greater_equal, "and": np.bitwise_and, "or": np.bitwise_or},
-    **{"max": np.maximum, "min": np.minimum, "rem": np.fmod},
-}
-
-
 def _same(x: Taylor, **_: Any) -> Taylor:
     return x
 
@@ -413,32 +255,12 @@ def _larger(a: Taylor | np.ndarray, b: Taylor | np.ndarray, sign: float = 1.0, *
 
 def _contracted(
     a: Taylor | np.ndarray, b: Taylor | np.ndarray, dimension_numbers: Any, **_: Any
-) -> Taylor:
-    """Return the sum of products over the contracted axes, with the axes of `lax.dot_general`:
-    shared ones, those of a, those of b."""
-    (of_a, of_b), (shared_a, shared_b) = dimension_numbers
-
-    def ordered(x: Any, shared: Any, contracted: Any) -> tuple[Any, int]:
-        own = [i for i in range(len(x.shape)) if i not in (*shared, *contracted)]
-        order = (*shared, *own, *contracted)
-        if isinstance(x, Taylor):
-            return x.mapped(lambda ends: _transposed(ends, 2, order)), len(own)
-        return np.transpose(x, order), len(own)
-
-    def widened(x: Any, at: int, count: int) -> Any:
-        sizes = (*x.shape[:at], *(1,) * count, *x.shape[at:])
-        if isinstance(x, Taylor):
-            return x.mapped(lambda ends: ends.reshape(*ends.shape[:2], *sizes))
-        return x.reshape(sizes)
-
-    (x, free_x), (y, free_y) = ordered(a, shared_a, of_a), ordered(b, shared_b, of_b)
-    batch = len(shared_a)
-    x, y = widened(x, batch + free_x, free_y), widened(y, batch, free_x)
+) -> Any:
+    x, y, axes = for_product(a, b, dimension_numbers)
     product = _product(x, y)
-    axes = range(batch + free_x + free_y, len(product.shape))
     if not isinstance(product, Taylor):
-        return product.sum(axis=tuple(axes))
-    return product.summed(axes) if len(axes) else product
+        return product.sum(axis=axes)
+    return product.summed(axes) if axes else product
 
 
 RULES: dict[str, Callable[..., Taylor]] = {
@@ -450,3 +272,43 @@ RULES: dict[str, Callable[..., Taylor]] = {
     "reduce_sum": lambda x, axes, **_: x.summed(axes),
     "dot_general": _contracted,
 }
+
+
+class TaylorProgram(TracedProgram):
+    """A function of JAX as a program on boxes, see `TracedProgram`.
+
+    `program(box, points)`, an Interval (boxes, d) in all d numbers of its arguments and a point
+    (boxes, d) in each, returns the leaves of the result as `Taylor`s, or as arrays where they are
+    constant.
+
+    Raises ValueError, naming the operation, where the function has one without a rule here, such as
+    loops, branches and maxima, and ZeroDivisionError where an enclosure that is divided by holds 0
+    (take smaller boxes).
+    """
+
+    kind, rules = Taylor, RULES
+
+    def __call__(self, box: Interval, points: np.ndarray) -> list:
+        starts = np.cumsum([0, *self.sizes])
+        args = [
+            variables(box, points, range(start, start + size))
+            for start, size in zip(starts, self.sizes, strict=False)
+        ]
+        with guarded():
+            return self.evaluated(args)
+
+    def joined(self, operands: Sequence) -> Taylor:
+        """Return flat operands one after the other."""
+        like = next(v for v in operands if isinstance(v, Taylor))
+        parts = _aligned([v if isinstance(v, Taylor) else _constant(v, like) for v in operands])
+        ends = (
+            np.concatenate([getattr(part.of, end) for part in parts], axis=-1)
+            for end in ("lower", "upper")
+        )
+        return Taylor(parts[0].variables, Interval(*ends), like.steps)
+
+    def unknown(self, eqn: Any, given: Sequence) -> list:
+        """Raise ValueError."""
+        name = eqn.primitive.name
+        problem = f"its program has the operation {name}, whose range over a box is not known here"
+        fail("robot", problem, "Take rigid bodies with motors: no contacts, tendons or loops")

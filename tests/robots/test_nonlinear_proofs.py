@@ -11,6 +11,7 @@ import pytest
 import jaxmpc as jm
 from jaxmpc.robots import intervals
 from jaxmpc.robots.intervals import Interval
+from jaxmpc.robots.polynomial_degrees import polynomial_degrees
 from jaxmpc.robots.taylor_enclosures import TaylorProgram
 
 
@@ -123,6 +124,23 @@ def test_programs_that_decide_are_refused():
         program(intervals.point([[0.5]]), np.array([[0.5]]))
 
 
+def test_degrees_of_programs():
+    """By hand, entry by entry: v counts once and u twice, q is in any operation."""
+
+    def program(q, v, u):
+        A = jnp.array([[1.0, 0.0], [2.0, 3.0]]) * jnp.sin(q)[:, None]
+        mixed = jnp.stack([v[0], u[0]])
+        chosen = jnp.where(q > 0, q, jnp.exp(q)) * v
+        nothing = jnp.tanh(v[:1]), v[:1] / v[1:], jnp.where(v[:1] > 0, q[:1], q[1:])
+        limited = jnp.clip(u, -jnp.inf, jnp.inf), jnp.clip(u, -1.0, 1.0)
+        exact = A @ mixed, chosen, v**3 * q, u * u - v[0], v[:1] * jnp.zeros(1), v / (q**2 + 1)
+        return jnp.concatenate(exact), jnp.concatenate([*nothing, *limited])
+
+    exact, others = polynomial_degrees(program, (2, 2, 1), (0, 1, 2))
+    np.testing.assert_array_equal(exact, [1, 2, 1, 1, 3, 3, 4, -np.inf, 1, 1])
+    np.testing.assert_array_equal(others, [np.inf, np.inf, np.inf, 2, np.inf])
+
+
 HALF = np.array([np.pi / 6, 2.0])
 
 
@@ -227,3 +245,12 @@ def test_ends_of_joints_are_kept_away_from():
     text = BODY.format(joint='range="-1 1" limited="true"', motor=MOTOR, geom=FREE, more="")
     states = jm.Box([-1.0, -2.0], [1.0, 2.0])
     refused(text, "the joint stops at", states=states, tolerance=0.5)
+
+
+@pytest.mark.slow
+def test_forces_of_other_degrees_are_refused():
+    """A gain that depends on the speed makes products of speeds and inputs."""
+    pump = '<general joint="j" gaintype="affine" gainprm="1 0 .1" ctrlrange="-5 5"/>'
+    text = BODY.format(joint="", motor=pump, geom=FREE, more="")
+    box = jm.Box(-np.ones(2), np.ones(2))
+    refused(text, "not quadratic in speeds and affine in inputs", states=box)
