@@ -54,6 +54,15 @@ def test_links():
         assert (ROOT / target).exists(), target
 
 
+def test_names_at_the_top_level():
+    """Pages of the reference say which of their names are there."""
+    for page in sorted((ROOT / "docs/reference").glob("*.md")):
+        text = page.read_text().partition("also at the top level")
+        if text[1]:
+            names = re.findall(r"`jm\.([\w.]+)`", text[0])
+            assert names and set(names) <= set(jm.__all__), page.name
+
+
 @pytest.mark.slow
 def test_nonlinear(capsys):
     names = run("docs/how-to/nonlinear.md")[0]

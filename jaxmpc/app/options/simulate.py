@@ -53,7 +53,7 @@ class SimulateOptions:
                      (1e-6 of the limit, where that is above 1). The margin is not counted in.
       plans valid    robots all of whose plans were solved without fallback; how many kept limits
       worst          the largest violation relative to half the range, in its own unit
-      plans solved   plans whose residuals pass: 1e-6 in float64, 1e-3 in float32
+      plans solved   plans whose residuals pass: 1e-6; along trajectories in float32 1e-3
       fallback       solved plans that need slack: soft limits are violated on their horizon
       unsolved       the other plans; of limits they say nothing
       settling       time after which a robot stays within the tolerance for the rest of its run

@@ -63,7 +63,7 @@ class TuneWeightsOptions:
       loss        mean over the validation loops, before and after, and the change
       violated    validation loops that violate a limit of states or inputs by more than 1e-6 (of
                   the limit, where that is above 1), not counting the tightening
-      unsolved    plans whose residuals exceed 1e-6 (float64) or 1e-3 (float32)
+      unsolved    plans whose residuals exceed 1e-6 (along trajectories in float32 1e-3)
       infeasible  those of them that are proved infeasible
       fallback    plans that are solved with slack: soft limits are violated on their horizon
       at target   loops that end within --tolerance of half the range of each state
