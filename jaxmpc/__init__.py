@@ -19,6 +19,7 @@ JAX is loaded.
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from jaxmpc.names import raise_absent
 from jaxmpc.version import __version__ as __version__
 
 if TYPE_CHECKING:
@@ -143,8 +144,8 @@ HOMES = {
 
 def __getattr__(name: str) -> Any:
     """Import a name when it is first used."""
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name not in (*__all__, "app"):
+        raise_absent(__name__, name)
     home = next((home for home, names in HOMES.items() if name in names.split()), None)
     if home is None:
         return import_module(f"{__name__}.{name}")
@@ -153,4 +154,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted(["__version__", "app", *__all__])

@@ -17,6 +17,8 @@ from typing import Any, NoReturn
 
 import numpy as np
 
+from jaxmpc.names import public_name
+
 # Counts are 32-bit integers in compiled programs.
 MOST_COUNT = 2**31 - 1
 
@@ -58,11 +60,11 @@ def nearest(word: str, known: Iterable[str]) -> str:
     return f"Did you mean {found[0]}? " if found else ""
 
 
-def require_kind(argument: str, value: Any, *kinds: type) -> None:
-    """Raise unless `value` is of one of these kinds."""
+def require_kind(argument: str, value: Any, *kinds: type, cure: str = "") -> None:
+    """Raise unless `value` is of one of these kinds. cure: what to do; "": give one of them."""
     if not isinstance(value, kinds):
-        wanted = " or ".join(kind.__name__ for kind in kinds)
-        fail(argument, f"is a {type(value).__name__}", f"Give a jm.{wanted}")
+        wanted = " or ".join(public_name(kind.__name__) for kind in kinds)
+        fail(argument, f"is a {type(value).__name__}", cure or f"Give a {wanted}")
 
 
 def require_package(package: str, extra: str) -> None:

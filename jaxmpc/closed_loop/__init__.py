@@ -10,7 +10,7 @@ robot_mpc                  the MPC of a robot, from the limits of its model
 enclosed_mpc               the robust MPC whose proofs hold for a nonlinear robot
 draw_disturbances          random sequences of the disturbances of a robust problem
 worst_disturbance          one that brings a closed loop far beyond its limits, by gradient
-LinearFeedback             LQR or PD with clipping, to compare with
+LinearFeedback             LQR or PD with clipping, to compare with -> NoPlan in place of a plan
 Noise                      random disturbances of the plant and of what is measured
 KalmanFilter               estimates of the state from noisy outputs -> Belief
 Disturbance                a constant disturbance that a KalmanFilter estimates too
@@ -24,27 +24,34 @@ randomised                 random masses, damping, payloads of robots, for `vari
 """
 
 from jaxmpc.closed_loop.disturbances import draw_disturbances, worst_disturbance
-from jaxmpc.closed_loop.environment import Environment, MPCPolicy
-from jaxmpc.closed_loop.estimation import Disturbance, KalmanFilter, Noise
-from jaxmpc.closed_loop.feedback import LinearFeedback
+from jaxmpc.closed_loop.environment import Environment, EnvironmentState, MPCPolicy
+from jaxmpc.closed_loop.estimation import Belief, Disturbance, KalmanFilter, Noise
+from jaxmpc.closed_loop.feedback import LinearFeedback, NoPlan
 from jaxmpc.closed_loop.nonlinear_proofs import enclosed_mpc
 from jaxmpc.closed_loop.offset_free import OffsetFreeController, augmented
-from jaxmpc.closed_loop.outcome import evaluate_runs, summarise_runs
+from jaxmpc.closed_loop.outcome import Outcome, RunsSummary, evaluate_runs, summarise_runs
 from jaxmpc.closed_loop.robot_controller import RobotController, robot_mpc
 from jaxmpc.closed_loop.simulation import Run, lyapunov_decrease, simulate, simulate_many
-from jaxmpc.closed_loop.stored_runs import simulate_into
+from jaxmpc.closed_loop.stored_runs import StoredRuns, simulate_into
 from jaxmpc.closed_loop.variations import draw_robots, randomised
+from jaxmpc.names import suggest_names
 
 __all__ = [
+    "Belief",
     "Disturbance",
     "Environment",
+    "EnvironmentState",
     "KalmanFilter",
     "LinearFeedback",
     "MPCPolicy",
+    "NoPlan",
     "Noise",
     "OffsetFreeController",
+    "Outcome",
     "RobotController",
     "Run",
+    "RunsSummary",
+    "StoredRuns",
     "augmented",
     "draw_disturbances",
     "draw_robots",
@@ -59,3 +66,5 @@ __all__ = [
     "summarise_runs",
     "worst_disturbance",
 ]
+
+suggest_names(__name__)

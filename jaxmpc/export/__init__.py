@@ -9,14 +9,18 @@ check_fixed_steps     closed loops under the law of `export_c` beside precise pl
 """
 
 from jaxmpc.export.c_law import export_explicit_c
-from jaxmpc.export.c_solver import check_fixed_steps, export_c
+from jaxmpc.export.c_solver import ClosedLoopCheck, check_fixed_steps, export_c
 from jaxmpc.export.jax_program import export_jax
 from jaxmpc.export.step_search import choose_steps
+from jaxmpc.names import suggest_names
 
 __all__ = [
+    "ClosedLoopCheck",
     "check_fixed_steps",
     "choose_steps",
     "export_c",
     "export_explicit_c",
     "export_jax",
 ]
+
+suggest_names(__name__)

@@ -118,7 +118,8 @@ def export_explicit_c(
     Returns the paths. Raises ValueError where not all regions were found, for a name that C does
     not take, and for files that exist, unless overwrite.
     """
-    require_kind("regions", regions, CriticalRegions)
+    cure = "Give what jm.explicit.critical_regions(mpc) returns"
+    require_kind("regions", regions, CriticalRegions, cure=cure)
     files = CFiles.open(folder, name, dtype, tolerance, TOLERANCE, overwrite)
     if not regions.complete:
         cure = "Raise max_regions or seconds"

@@ -7,8 +7,9 @@ Bounds               the constraints of a QP on Az: intervals, hard or soft, and
 feasibility_margin   by how much all limits can be tightened, or must be widened
 """
 
+from jaxmpc.names import suggest_names
 from jaxmpc.qp.admm import ADMM
-from jaxmpc.qp.problem import QP, Bounds
+from jaxmpc.qp.problem import QP, Bounds, Duals, QPSolution
 from jaxmpc.qp.solve import feasibility_margin, solve_qp
 from jaxmpc.qp.status import Status
 
@@ -16,7 +17,11 @@ __all__ = [
     "ADMM",
     "QP",
     "Bounds",
+    "Duals",
+    "QPSolution",
     "Status",
     "feasibility_margin",
     "solve_qp",
 ]
+
+suggest_names(__name__)

@@ -4,7 +4,14 @@ LinearSystem    a system, also from continuous time
 lqr             the linear-quadratic regulator -> LQR
 """
 
-from jaxmpc.systems.riccati import lqr
+from jaxmpc.names import suggest_names
+from jaxmpc.systems.riccati import LQR, lqr
 from jaxmpc.systems.system import LinearSystem
 
-__all__ = ["LinearSystem", "lqr"]
+__all__ = [
+    "LQR",
+    "LinearSystem",
+    "lqr",
+]
+
+suggest_names(__name__)

@@ -1,7 +1,9 @@
 """Tuning by gradient descent, with a checkpoint after each step.
 
-tune_weights                              fields of an MPC, through its closed loops
+tune_weights                              fields of an MPC, through its closed loops -> TuningRun
+                                          with Settings and the steps of a Descent
 linear_task, robot_task                   what `jaxmpc tune weights` tunes: loops, loss, weights
+                                          -> WeightTask, with a loss as weight_loss makes it
 weight_parameters, feasible_states        its parameters, and initial states that have a plan
 run_folder                                the folder of a run that is resumed or overwritten
 MPCLayer                                  an MPC problem in a network, some of its data learned
@@ -12,20 +14,33 @@ tune_solver, transfer_penalties           penalties of ADMM, also for another ho
 Interrupted                               what all of these raise on Ctrl-C, with the best so far
 """
 
+from jaxmpc.names import suggest_names
+from jaxmpc.tuning.descent import Descent, Settings
 from jaxmpc.tuning.feasible_set import tune_feasible_set
 from jaxmpc.tuning.layer import MPCLayer
 from jaxmpc.tuning.losses import ClosedLoopLoss
 from jaxmpc.tuning.parameters import Parameter
-from jaxmpc.tuning.result import Interrupted, run_folder
+from jaxmpc.tuning.result import Interrupted, TuningRun, run_folder
 from jaxmpc.tuning.solver import transfer_penalties, tune_solver
-from jaxmpc.tuning.tasks import feasible_states, linear_task, robot_task, weight_parameters
+from jaxmpc.tuning.tasks import (
+    WeightTask,
+    feasible_states,
+    linear_task,
+    robot_task,
+    weight_loss,
+    weight_parameters,
+)
 from jaxmpc.tuning.weights import tune_weights
 
 __all__ = [
     "ClosedLoopLoss",
+    "Descent",
     "Interrupted",
     "MPCLayer",
     "Parameter",
+    "Settings",
+    "TuningRun",
+    "WeightTask",
     "feasible_states",
     "linear_task",
     "robot_task",
@@ -34,5 +49,8 @@ __all__ = [
     "tune_feasible_set",
     "tune_solver",
     "tune_weights",
+    "weight_loss",
     "weight_parameters",
 ]
+
+suggest_names(__name__)

@@ -3,6 +3,12 @@
 verify_map    prove the labels of a stored map again -> Verification
 """
 
-from jaxmpc.verify.stored_map import verify_map
+from jaxmpc.names import suggest_names
+from jaxmpc.verify.stored_map import Verification, verify_map
 
-__all__ = ["verify_map"]
+__all__ = [
+    "Verification",
+    "verify_map",
+]
+
+suggest_names(__name__)

@@ -40,7 +40,8 @@ def plot_regions(
 
     Raises ValueError for fewer than two parameters and for wrong arguments.
     """
-    require_kind("regions", regions, CriticalRegions)
+    cure = "Give what jm.explicit.critical_regions(mpc) returns"
+    require_kind("regions", regions, CriticalRegions, cure=cure)
     p, names = regions.problem.dimension, regions.problem.labels
     if p < 2 or len(set(axes)) != 2 or not all(0 <= i < p for i in axes):
         fail("axes", f"{axes} of {p} parameters", "Give two different parameters")
