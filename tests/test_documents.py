@@ -55,7 +55,13 @@ def test_links():
 
 
 def test_names_at_the_top_level():
-    """Pages of the reference say which of their names are there."""
+    """The pages of the reference say which of their names are there, their index all of them."""
+    table = re.findall(
+        r"^\| \[.*\|([^|]*)\|$", (ROOT / "docs/reference/index.md").read_text(), re.M
+    )
+    listed = re.findall(r"`(\w+)`", " ".join(table))
+    rooms = {path.name for path in (ROOT / "jaxmpc").iterdir() if path.is_dir()}
+    assert sorted(listed) == sorted(set(jm.__all__) - rooms)
     for page in sorted((ROOT / "docs/reference").glob("*.md")):
         text = page.read_text().partition("also at the top level")
         if text[1]:
