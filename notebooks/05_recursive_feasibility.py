@@ -129,11 +129,11 @@ for axis in (left, right):
     axis.plot(*closed(X3).T, color="0.4", linewidth=1)
     axis.set(xlabel="position (m)", ylabel="velocity (m/s)")
 gone = x0s[lost >= 1]
-left.plot(*gone.T, ".", color="tab:red", markersize=4, label="lost later")
+left.plot(*gone.T, ".", color="#d55e00", markersize=4, label="lost later")
 left.plot(*worst.state, "k*", label="worst state")
 left.legend(loc="lower left")
 sign = np.sign(worst.state[1])  # show the corner of the worst state
-right.plot(*gone.T, ".", color="tab:red", markersize=4)
+right.plot(*gone.T, ".", color="#d55e00", markersize=4)
 right.annotate(
     "", xy=worst.next_state, xytext=worst.state, arrowprops=dict(arrowstyle="->", linewidth=1.2)
 )
@@ -188,9 +188,9 @@ assert terminal.volume() < small.volume() < longer.volume
 # %%
 fig, axis = plt.subplots(figsize=(6, 3.5))
 for body, label, style in (
-    (report.feasible_set, "$X_3$, no terminal set (refuted)", "tab:red"),
-    (longer.feasible_set, "$X_4$, no terminal set (proved)", "tab:green"),
-    (small, "$X_3$ with terminal set (proved)", "tab:blue"),
+    (report.feasible_set, "$X_3$, no terminal set (refuted)", "#d55e00"),
+    (longer.feasible_set, "$X_4$, no terminal set (proved)", "#006f52"),
+    (small, "$X_3$ with terminal set (proved)", "#0072b2"),
     (terminal, "terminal set", "0.5"),
 ):
     axis.plot(*closed(body.vertices()).T, color=style, label=label)

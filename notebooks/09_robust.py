@@ -99,9 +99,9 @@ assert np.all(runs["robust"].status == jm.Status.SOLVED)
 # %%
 figure, axes = plt.subplots(1, 2, figsize=(9, 3.5), sharey=True)
 for axis, (name, run) in zip(axes, runs.items(), strict=True):
-    axis.plot(run.states[:, :, 0].T, run.states[:, :, 1].T, lw=0.7)
-    axis.add_patch(plt.Rectangle((-1.5, -2), 3, 4, fill=False, color="grey"))
-    axis.set(title=name, xlabel="q [rad]", xlim=(0, 1.6), ylim=(-2.2, 2.2))
+    axis.plot(run.states[:, :, 0].T, run.states[:, :, 1].T, lw=0.7, color="#0072b2")
+    axis.axhspan(-2.1, -2, color="#dddcd8")  # beyond the limit, near which the loops differ
+    axis.set(title=name, xlabel="q [rad]", xlim=(0.1, 0.45), ylim=(-2.05, -1.5))
 axes[0].set_ylabel("velocity [rad/s]")
 figure.tight_layout()
 

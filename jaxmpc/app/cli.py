@@ -14,7 +14,7 @@ import time
 import types
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import fields, make_dataclass
+from dataclasses import MISSING, fields, make_dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
@@ -249,6 +249,9 @@ def parse_options(kind: Any, prog: str, words: Sequence[str]) -> tuple[Everywher
         if not stop.code:
             raise
         name = next((w for w in re.findall(r"--[\w-]+", text.getvalue()) if w in known), None)
+        needed = next((field.name for field in fields(kind) if field.default is MISSING), None)
+        if name is None and needed is not None:
+            fail(prog, f"no {needed} given", f"Name it after the command; see {prog} --help")
         if name is None:
             fail(prog, " ".join(re.sub(r"[^ -~]", " ", text.getvalue()).split()), "")
         wanted = f"Give {described_type(get_type_hints(both)[known[name]])}"
