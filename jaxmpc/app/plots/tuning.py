@@ -23,8 +23,10 @@ FRACTIONS = (
     ("fallback", "plans with slack in soft limits (fallback)", "#e69f00", "-"),
     ("violation", "loops beyond the limits", "#006f52", ":"),
 )
-# Lines of a panel that get a name each; more are named by the groups they belong to.
-NAMED = 10
+# Lines of a panel that get a colour and a name each (Okabe and Ito's palette); more are named by
+# the groups they belong to.
+COLOURS = "#0072b2", "#d55e00", "#006f52", "#e69f00", "#cc79a7", "#56b4e9", "#000000", "#8a8a8a"
+NAMED = len(COLOURS)
 # Rows of a block.
 DASHES: tuple[Any, ...] = ("-", (0, (4, 2)), (0, (1, 1.5)), (0, (5, 1, 1, 1)))
 
@@ -149,11 +151,10 @@ def _draw_weights(
 ) -> None:
     """Draw each weight over its start: one colour a line, or one a group where there are many."""
     count = sum(len(entries) for entries in weights.values())
-    colours = matplotlib.colormaps["tab10"].colors  # type: ignore[attr-defined]
     i, handles, ratios = 0, [], []
     for g, (group, entries) in enumerate(weights.items()):
         for name, values in entries.items():
-            colour = colours[(i if count <= NAMED else g) % len(colours)]
+            colour = COLOURS[(i if count <= NAMED else g) % NAMED]
             ratios.append(values / values[0])
             alpha = 1 if count <= NAMED else 0.6
             _line(ax, steps, ratios[-1], color=colour, lw=1.3, alpha=alpha)
@@ -161,7 +162,7 @@ def _draw_weights(
                 handles.append(Line2D([], [], color=colour, label=f"{group} {name}".strip()))
             i += 1
         if count > NAMED:
-            colour = colours[g % len(colours)]
+            colour = COLOURS[g % NAMED]
             label = f"{group} ({len(entries)})" if len(entries) > 1 else group
             handles.append(Line2D([], [], color=colour, label=label))
     ax.axhline(1, color=EDGE, lw=0.7, zorder=0)
