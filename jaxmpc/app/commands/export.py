@@ -93,6 +93,8 @@ class Export(ExportOptions):
             given = "" if config.solver else ", chosen, as their penalties, for 99 % below"
             if config.solver is None and self.iterations is not None:
                 given = ", given; their penalties are chosen for the share below"
+            elif config.solver is None and share < 99:
+                given = ", chosen, as their penalties; 99 % need more --iterations"
             rows += [
                 ("ADMM steps a call", f"{solver.iterations}{given}"),
                 ("plans of closed loops", f"{found.plans}, {found.solvable} can be solved"),
