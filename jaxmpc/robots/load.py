@@ -119,6 +119,7 @@ def load_robot(
     smooth = copy.deepcopy(host)
     for kind in ("contact", "limit", "frictionloss") if equalities(host) else ("constraint",):
         smooth.opt.disableflags |= flag(kind)
+    smooth.opt.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL  # MJX fails on others without contacts
     smooth.actuator_forcelimited[:] = 0
     smooth.jnt_actfrclimited[:] = 0
     smooth.tendon_actfrclimited[:] = 0

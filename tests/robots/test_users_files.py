@@ -38,14 +38,16 @@ def test_a_urdf_of_any_name(tmp_path):
 def test_contacts_are_left_out_on_request(tmp_path):
     """And where many meshes could touch, a warning names that."""
     corners = "0 0 0  .1 0 0  0 .1 0  0 0 .1"
-    body = '<body pos="0 0 {}"><joint type="slide"/><geom type="mesh" mesh="m"/></body>'
-    text = f'''<mujoco><asset><mesh name="m" vertex="{corners}"/></asset><worldbody>
+    body = '<body pos="0 0 {}"><joint type="slide" range="-9 9"/><geom type="mesh" mesh="m"/></body>'
+    text = f'''<mujoco><option cone="elliptic"/><asset><mesh name="m" vertex="{corners}"/></asset><worldbody>
     {"".join(body.format(i) for i in range(4))}</worldbody><actuator><motor site="s"/></actuator>
     </mujoco>'''.replace("</worldbody>", '<site name="s"/></worldbody>')
     path = Path(tmp_path / "four.xml")
     path.write_text(text)
     robot = jm.load_robot(path, contacts=False)
-    assert robot.report().left_out == ("all contacts",) and not robot.plant.rows
+    assert robot.report().left_out == ("all contacts",)
+    x, u = robot.home, np.zeros(1)
+    np.testing.assert_allclose(robot.step(x, u)[4:], -9.81 * robot.dt, rtol=1e-5)
     with pytest.warns(UserWarning, match="four has 6 pairs of meshes .* load it with contacts=Fal"):
         _warn_of_meshes("four", mujoco.MjModel.from_xml_path(str(path)))
 
