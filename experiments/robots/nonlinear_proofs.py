@@ -155,13 +155,15 @@ def policy_excess(robot: Any, mpc: Any, found: Any, folder: Path, settings: Sett
         directions = rng.normal(size=(settings.rays, robot.n)) * found.states.half_widths()
         ends = jm.feasible.boundary(mpc, directions, center=found.x).points
         ends = found.x + (ends - found.x) * (1 - 1e-6)
-        ends = ends[jm.map_feasible_set(mpc, ends).label == 1]
+        proved = jm.map_feasible_set(mpc, ends).label == 1
         with jax.enable_x64(True):
             plans = jm.solve_many(mpc, ends)
-        return ends, np.asarray(plans.states), np.asarray(plans.inputs)
+        # The label says that there is a plan; the policy needs the plan itself.
+        known = proved & (np.asarray(plans.status) == jm.Status.SOLVED)
+        print(f"  {settings.rays} ends of rays: {proved.sum()} proved, {known.sum()} with a plan")
+        return ends[known], np.asarray(plans.states)[known], np.asarray(plans.inputs)[known]
 
     ends = kept_at(folder / "ends.pickle", at_ends)
-    print(f"  {len(ends[0])} of {settings.rays} ends of rays are proved")
     run = policy_runs(robot, mpc, found)
 
     def excess(number: int) -> np.ndarray:
