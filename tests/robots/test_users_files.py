@@ -37,11 +37,12 @@ def test_a_urdf_of_any_name(tmp_path):
 
 def test_contacts_are_left_out_on_request(tmp_path):
     """And where many meshes could touch, a warning names that."""
-    corners = "0 0 0  .1 0 0  0 .1 0  0 0 .1"
-    body = '<body pos="0 0 {}"><joint type="slide" range="-9 9"/><geom type="mesh" mesh="m"/></body>'
-    text = f'''<mujoco><option cone="elliptic"/><asset><mesh name="m" vertex="{corners}"/></asset><worldbody>
-    {"".join(body.format(i) for i in range(4))}</worldbody><actuator><motor site="s"/></actuator>
-    </mujoco>'''.replace("</worldbody>", '<site name="s"/></worldbody>')
+    body = """<body pos="0 0 {}"><joint type="slide" range="-9 9"/><geom type="mesh" mesh="m"/>
+    </body>"""
+    text = f"""<mujoco><option cone="elliptic"/><asset>
+    <mesh name="m" vertex="0 0 0  .1 0 0  0 .1 0  0 0 .1"/></asset>
+    <worldbody>{"".join(body.format(i) for i in range(4))}<site name="s"/></worldbody>
+    <actuator><motor site="s"/></actuator></mujoco>"""
     path = Path(tmp_path / "four.xml")
     path.write_text(text)
     robot = jm.load_robot(path, contacts=False)
