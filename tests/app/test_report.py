@@ -89,6 +89,7 @@ def test_text_and_tables_are_escaped():
 
 def test_a_picture_has_the_name_of_its_system(tmp_path):
     figure = Figure()
-    figure.add_subplot().set_title("Feasible initial states", loc="left")
+    figure.add_subplot().plot([0, 1], [0, 1])
+    figure.axes[0].set_title("Feasible initial states", loc="left")
     save(figure, tmp_path / "a.png", "joint")
     assert figure.axes[0].get_title(loc="left") == "joint: feasible initial states"
