@@ -129,6 +129,22 @@ def test_fields_of_the_report_are_those_of_its_parts():
     assert (found["loops"]["starts"], found["loops"]["increase"]) == (6, 0.25)
 
 
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ("--json sweep --horizon 3", "sweep --json --horizon 3"),
+        ("--format pdf tune weights --updates 3", "tune weights --format pdf --updates 3"),
+        ("--help sweep", "sweep --help"),
+        ("report sweep --json", "report sweep --json"),
+        ("--json", "--json"),
+        ("--tyro-write-completion bash sweep", "--tyro-write-completion bash sweep"),
+        ("", ""),
+    ],
+)
+def test_options_before_the_command_belong_to_it(given, words):
+    assert cli.command_first(given.split()) == words.split()
+
+
 @pytest.mark.parametrize("words", [["--format", "gif"], ["--format=gif"], ["--format"]])
 def test_other_formats_are_refused(words, capsys):
     assert cli.main(["init", *words]) == 2
