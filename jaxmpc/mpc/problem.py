@@ -182,8 +182,9 @@ class MPC:
         system: LinearSystem with n states and m inputs. A (N, n, n), B (N, n, m) and c (N, n), or
             some of them, make it another one at each step: x_{k+1} = A_k x_k + B_k u_k + c_k.
         Q: (n, n) ⪰ 0, or its diagonal (n,), or a number for one state; or one for each step,
-            (N, n, n).
-        R: (m, m) ⪰ 0, or its diagonal (m,), or a number for one input; or (N, m, m).
+            (N, n, n), also (N,) for one state.
+        R: (m, m) ⪰ 0, or its diagonal (m,), or a number for one input; or (N, m, m), also (N,) for
+            one input.
         horizon: N ≥ 1.
         states: Box or Polytope in the units of x; None: no limits. Its arrays may have a leading
             axis, an entry for each k at which it holds: lower (N, n), H (N, rows, n) and so on.
@@ -606,6 +607,10 @@ class MPC:
         labels = self.system.input_names or tuple(f"u{i + 1}" for i in range(self.system.m))
         large = (abs(directions) > 0.1 * abs(directions).max(axis=0)).any(axis=1)
         names = ", ".join(name for name, one in zip(labels, large, strict=True) if one)
+        if self.stage_weights is not None and np.asarray(self.stage_weights)[k] == 0:
+            what = f"is 0 at k = {k}, where R then costs nothing and no other weight gives {names}"
+            cure = f"Give stage {k} a positive weight, or every input one in input_rate_weight"
+            fail("stage_weights", f"{what} a cost", cure)
         what = f"is not positive definite, and at k = {k} no other weight gives {names} a cost"
         cure = "Put a positive weight on every input, in R or in input_rate_weight"
         last = self.terminal_cost is None and k == self.horizon - 1

@@ -35,7 +35,8 @@ LATE = "the time was over before its linear programs were solved"
 class Claim:
     """A claim, whether it holds, and why.
 
-    holds: True (proved), False (refuted) or None (open). reason: in words.
+    holds: True (proved, with limits that count as kept up to 1e-9 of the size of the set), False
+    (refuted) or None (open). reason: in words.
     state (p,): where it is refuted, the state of the counterexample; else None.
     """
 

@@ -16,6 +16,12 @@ from jaxmpc.sets.convex_sets import Polytope
 
 # The files of a report in its folder.
 FILES = ("summary.json", "recursion.npz", "recursion.png")
+# Where counterexamples are found.
+FOUND = {
+    "regions": "at a vertex of a critical region",
+    "search": "by gradient ascent over the regions",
+    "sample": "by a closed loop from a sample",
+}
 
 
 @record
@@ -55,18 +61,21 @@ class RecursionReport:
         line."""
         rows = [(name, str(claim)) for name, claim in self.claims.items()]
         if self.counterexample is not None:
-            rows.append(("worst", f"{self.counterexample} (found by {self.counterexample.found})"))
+            rows.append(("worst", f"{self.counterexample} ({FOUND[self.counterexample.found]})"))
         if np.isfinite(self.volume):
             rows.append(("volume", f"{self.volume:.9g}{self.mpc.volume_unit()}"))
-        for name, lost in (("lost by any", self.lost_by_any), ("lost by law", self.lost_by_law)):
+        parts = ("lost, any input", self.lost_by_any), ("lost, optimal input", self.lost_by_law)
+        for name, lost in parts:
             if np.isfinite(lost):
-                rows.append((name, f"{lost:.9g}  {lost / self.volume:.4%}"))
+                rows.append((name, f"{lost:.9g}  {lost / self.volume:.4%} of the volume"))
         counts = self.loops.counts()
         feasible = counts.pop("feasible")
         if len(self.loops.x0s):
-            rows.append(("feasible", f"{feasible:>10,}"))
+            rows.append(("samples", f"{len(self.loops.x0s):>10,}  of {self.loops.steps} steps"))
+            rows.append(("- feasible", f"{feasible:>10,}"))
             for name, count in counts.items():
-                rows.append((name, f"{count:>10,}  {count / max(feasible, 1):8.3%}"))
+                share = f"{count / max(feasible, 1):8.3%} of the feasible"
+                rows.append((f"- {name}", f"{count:>10,}  {share}"))
         else:
             why = "its law is proved" if self.law.holds else "no time was left for them"
             rows.append(("samples", f"none: {why}"))

@@ -6,6 +6,7 @@ import io
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
+from textwrap import shorten
 from typing import Any
 
 import numpy as np
@@ -20,10 +21,14 @@ from jaxmpc.sets.limits import row_violations, rows_kept
 
 # The target has the colour of set-points in the plots; red is for limits alone.
 INK, PAPER, RED, TARGET = (40, 40, 40), (255, 255, 255), (200, 20, 20), (0, 158, 115)
-OPACITY = 0.3  # of the target
-# Grey of what a model without a skybox leaves black, and colour of capsules in place of shapes.
+OPACITY = 0.45  # of the target
+# By how much the shapes of the target are thicker: it is seen around a robot that has arrived.
+THICKER = 1.15
+# Colours of capsules in place of shapes, of what a model without a skybox leaves black, and of the
+# floor under a model that has none; light, for MuJoCo's own colour of shapes is a middle grey.
 LINK = np.array([0.75, 0.75, 0.8, 1], np.float32)
-BACKGROUND = np.array([0.5, 0.5, 0.5, 1], np.float32)
+BACKGROUND = np.array([0.87, 0.9, 0.93, 1], np.float32)
+FLOOR = np.array([0.72, 0.74, 0.76, 1], np.float32)
 
 
 def render(
@@ -47,7 +52,8 @@ def render(
     each tile; None for none. every: states from one frame to the next. width, height: pixels of a
     tile. camera: the name of one of the model's; None, or "view" where the model has none of that
     name, for a camera that sees all that moves, at all times. What a model without a skybox leaves
-    black is grey; bodies without shapes are capsules from joint to joint.
+    black is light grey, and a model without a plane gets a floor below all that moves; bodies
+    without shapes are capsules from joint to joint.
 
     labels: write the robot's name and the time in s above, a legend below, and numbers on the
     tiles. numbers: those of the robots, None: from 0.
@@ -72,10 +78,12 @@ def render(
         if camera != "view":
             fail("camera", f"the model has none named {camera!r}", "Give one of its, or None")
         view = None
+    poses = motions[:, :: max(1, samples // 20), : model.nq].reshape(-1, model.nq)
+    poses = poses if ghosts is None else np.concatenate([poses, ghosts])
+    ends = _ends(model, poses)
     if view is None:
-        poses = motions[:, :: max(1, samples // 20), : model.nq].reshape(-1, model.nq)
-        poses = poses if ghosts is None else np.concatenate([poses, ghosts])
-        view = _camera(model, poses, width / height)
+        view = _camera(model, ends, width / height)
+    floor = None if np.any(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE) else ends
     columns = int(np.ceil(np.sqrt(count)))
     rows = -(-count // columns)
     tiles = [(height * (i // columns), width * (i % columns)) for i in range(count)]
@@ -84,7 +92,7 @@ def render(
     with _renderer(model, width, height) as renderer:
         for (top, left), motion in zip(tiles, drawn, strict=True):
             tile = film[:, top : top + height, left : left + width]
-            _draw(tile, renderer, model, view, motion, ghosts)
+            _draw(tile, renderer, model, view, motion, ghosts, floor)
     for row in range(1, rows):
         film[:, row * height - 1 : row * height + 1] = 255
     for column in range(1, columns):
@@ -150,10 +158,11 @@ def _renderer(model: "mujoco.MjModel", width: int, height: int) -> "mujoco.Rende
             warnings.simplefilter("ignore")  # GLFW warns of what follows as an error
             return mujoco.Renderer(model, height, width)
     except Exception as error:  # of MuJoCo, OpenGL or EGL, whichever is missing
+        said = shorten(str(error), 400, placeholder=" …") or type(error).__name__
         raise RuntimeError(
-            f"no video: MuJoCo finds no renderer ({' '.join(str(error).split())[:120]}). Without "
-            "a display set MUJOCO_GL=egl before Python starts; on Debian or Ubuntu install "
-            "libegl1 libegl-mesa0 libgl1-mesa-dri libgl1"
+            "no video: MuJoCo finds no renderer. Without a display set MUJOCO_GL=egl before Python "
+            "starts (export MUJOCO_GL=egl); on Debian or Ubuntu install libegl1 libegl-mesa0 "
+            f"libgl1-mesa-dri libgl1. MuJoCo says: {said}"
         ) from None
 
 
@@ -164,8 +173,10 @@ def _draw(
     view: Any,
     motion: np.ndarray,
     target: np.ndarray | None,
+    floor: np.ndarray | None,
 ) -> None:
-    """Draw one robot at its qpos (F, nq) into frames (F, h, w, 3), and the target beside it."""
+    """Draw one robot at its qpos (F, nq) into frames (F, h, w, 3), the target beside it, and a
+    floor below the box with these corners (2, 3)."""
     data, ghost = mujoco.MjData(model), mujoco.MjData(model)
     sky = np.any(model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX)
     for k, (frame, q) in enumerate(zip(frames, motion, strict=True)):
@@ -179,6 +190,8 @@ def _draw(
             _add_ghost(renderer.scene, model, ghost)
         if not sky:
             _add_backdrop(renderer.scene)
+        if floor is not None and len(floor):
+            _add_floor(renderer.scene, *floor)
         frame[:] = renderer.render()
 
 
@@ -195,12 +208,21 @@ def _add_backdrop(scene: "mujoco.MjvScene") -> None:
     scene.ngeom += 1
 
 
-def _camera(model: "mujoco.MjModel", poses: np.ndarray, aspect: float) -> "mujoco.MjvCamera":
-    """Return MuJoCo's free camera, moved so that it sees what moves at all poses (k, nq).
+def _add_floor(scene: "mujoco.MjvScene", lower: np.ndarray, upper: np.ndarray) -> None:
+    """Add a plate a little below a box with these corners, twice as wide as the box is long."""
+    side = float(np.max(upper - lower))
+    middle = (lower + upper) / 2
+    place = np.array([middle[0], middle[1], lower[2] - 0.02 * side])
+    plate, size = scene.geoms[scene.ngeom], side * np.array([1.0, 1.0, 0.01])
+    mujoco.mjv_initGeom(plate, mujoco.mjtGeom.mjGEOM_BOX, size, place, np.eye(3).ravel(), FLOOR)
+    plate.category = mujoco.mjtCatBit.mjCAT_DECOR
+    scene.ngeom += 1
 
-    aspect: width by height of a picture."""
-    camera, data = mujoco.MjvCamera(), mujoco.MjData(model)
-    mujoco.mjv_defaultFreeCamera(model, camera)
+
+def _ends(model: "mujoco.MjModel", poses: np.ndarray) -> np.ndarray:
+    """Return the corners (2, 3) of a box around what moves at all poses (k, nq), (0, 3) where
+    nothing does."""
+    data = mujoco.MjData(model)
     moving = (model.body_weldid[model.geom_bodyid] != 0) & (model.geom_rbound > 0)
     size, ends = model.geom_rbound[moving, None], []
     for pose in poses:
@@ -211,9 +233,18 @@ def _camera(model: "mujoco.MjModel", poses: np.ndarray, aspect: float) -> "mujoc
         points = np.concatenate([at - size, at + size, links])
         if len(points):
             ends += [points.min(axis=0), points.max(axis=0)]
-    if not ends:
+    return np.array([np.min(ends, axis=0), np.max(ends, axis=0)]) if ends else np.zeros((0, 3))
+
+
+def _camera(model: "mujoco.MjModel", ends: np.ndarray, aspect: float) -> "mujoco.MjvCamera":
+    """Return MuJoCo's free camera, moved so that it sees the box with these corners, from `_ends`.
+
+    aspect: width by height of a picture."""
+    camera = mujoco.MjvCamera()
+    mujoco.mjv_defaultFreeCamera(model, camera)
+    if not len(ends):
         return camera
-    lower, upper = np.min(ends, axis=0), np.max(ends, axis=0)
+    lower, upper = ends
     half = np.deg2rad(model.vis.global_.fovy) / 2
     narrow = min(half, np.arctan(np.tan(half) * aspect))
     camera.lookat[:] = (lower + upper) / 2
@@ -253,7 +284,8 @@ def _add_ghost(scene: "mujoco.MjvScene", model: "mujoco.MjModel", data: "mujoco.
     """Add the moving bodies of a second robot to a scene, green and see-through.
 
     Each is 1 % further from the camera than it should be, along its line of sight: what coincides
-    with the robot itself is then hidden behind it, rather than drawn in turns with it.
+    with the robot itself is then hidden behind it, rather than drawn in turns with it. Shapes other
+    than meshes are thicker, and stay in sight around it.
     """
     first, moving = scene.ngeom, mujoco.mjtCatBit.mjCAT_DYNAMIC.value
     mujoco.mjv_addGeoms(model, data, mujoco.MjvOption(), mujoco.MjvPerturb(), moving, scene)
@@ -263,6 +295,8 @@ def _add_ghost(scene: "mujoco.MjvScene", model: "mujoco.MjModel", data: "mujoco.
         geom.rgba[:] = [*(v / 255 for v in TARGET), OPACITY]
         geom.matid, geom.reflectance = -1, 0.0
         geom.pos[:] += 0.01 * (geom.pos - eye)
+        if geom.type != mujoco.mjtGeom.mjGEOM_MESH:
+            geom.size[:] = THICKER * geom.size
 
 
 @record
@@ -290,11 +324,19 @@ class Film:
 
 
 def save_video(path: str | Path, frames: Any, fps: float) -> None:
-    """Write frames (F, h, w, 3), uint8, as path.gif, or as path.mp4 if imageio has ffmpeg.
+    """Write frames (F, h, w, 3), uint8, of `render` as path.gif, or as path.mp4.
 
-    fps: frames a second; GIF rounds the time of a frame to 10 ms and joins frames that are equal.
+        frames = jm.robots.render(robot, run.states)
+        jm.robots.save_video("arm.gif", frames, fps=1 / robot.dt)
+
+    GIF needs nothing more; MP4 needs imageio with ffmpeg, `pip install "imageio[ffmpeg]"`, which no
+    extra of jaxmpc brings along. fps: frames a second; GIF rounds the time of a
+    frame to 10 ms and joins frames that are equal.
     Raises ValueError for other endings and frames, and where .mp4 cannot be written.
     """
+    if not isinstance(path, str | Path):
+        cure = 'Give the path first: save_video("film.gif", frames, fps)'
+        fail("path", f"is a {type(path).__name__}", cure)
     path, frames = Path(path), np.asarray(frames)
     check_frames(frames, fps)
     kind = path.suffix.lower()

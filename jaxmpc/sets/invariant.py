@@ -26,6 +26,9 @@ from jaxmpc.systems.system import LinearSystem
 # A row counts as redundant if it is exceeded by no more than this, relative to its bound.
 # Rounding alone makes rows that just touch the set exceed their bound by about 1e-16.
 _REDUNDANT = 1e-12
+# The bounds of O_inf are less than those one step earlier by this, relative, beside what w takes:
+# more than the rounding of its rows, which would make most sets leave themselves by it.
+_DRAWN_IN = 1e-14
 # Names of terminal sets.
 TERMINAL_SETS = ("none", "box", "invariant", "ellipsoid")
 
@@ -82,7 +85,9 @@ def maximal_invariant_set(
     b_ij, j = 0..t}, where b_i0 = 1 and b_i,j+1 = b_ij - max {F_i (A+BK)^j w : w in W}; O_inf = O_t
     as soon as max {F_i (A+BK)^(t+1) x : x in O_t} <= b_i,t+1 for every i. An upper bound of the
     maximum is checked, made from the LP's multipliers and valid for any LP error; it may exceed the
-    right-hand side by 1e-12 of it. NumPy in float64; not traceable.
+    right-hand side by 1e-12 of it. Each b_i,j+1 is drawn in by a further 1e-14 of b_ij, so that
+    rounded rows are kept in rational arithmetic too, which `verify_terminal` checks. NumPy in
+    float64; not traceable.
 
     Raises ValueError if A + BK is not strictly stable, the origin is not in the interior of
     the constraints, the disturbance leaves no set around the origin, O_inf is unbounded, or
@@ -112,7 +117,7 @@ def maximal_invariant_set(
         # A row once redundant stays so: if F_i Acl^(t+1) x <= b_(t+1) on O_t, and Acl x + w is
         # in O_t for x in O_(t+1) and w in W, then F_i Acl^(t+2) x <= b_(t+2) on O_(t+1).
         # Only the others are propagated.
-        b, candidates = b - supports(W, newest), newest @ closed
+        b, candidates = (1 - _DRAWN_IN) * b - supports(W, newest), newest @ closed
         if b.min() <= 0:
             fail(
                 "disturbance",

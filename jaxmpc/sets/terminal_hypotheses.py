@@ -304,7 +304,10 @@ class _Rows:
         if exact is not None and exact <= 1:
             sentence += " In rational arithmetic the factor is at most 1."
         elif exact is not None and holds:
-            sentence += f" In rational arithmetic the factor exceeds 1 by {float(exact - 1):.1e}."
+            sentence += (
+                f" In rational arithmetic the factor exceeds 1 by {float(exact - 1):.1e}: kept up "
+                f"to rounding, for which {_TOUCH:g} of the extent is allowed."
+            )
         return _Invariance(
             Check(name, holds, float(slack[worst]), unit, sentence), M, factor, exact
         )

@@ -316,7 +316,7 @@ def test_recursion_writes_files_and_table(tmp_path, capsys, examined):
         "refuted: an example",
         "open: no facets",
         "0.25",
-        "lost by law",
+        "lost, optimal input",
         "smallest horizon     5 (by regions); strong from 6",
     ):
         assert word in out
@@ -440,7 +440,7 @@ def test_recursion_of_the_joint_for_real(tmp_path, capsys):
     assert [summary["claims"][name]["holds"] for name in ("strong", "law", "weak")] == [False] * 3
     assert abs(summary["counterexample"]["distance"] - 0.0039968) < 1e-6
     assert abs(summary["lost_by_law"] - 0.0016) < 1e-9
-    assert "found by regions" in capsys.readouterr().out
+    assert "at a vertex of a critical region" in capsys.readouterr().out
 
 
 @pytest.mark.slow

@@ -381,7 +381,8 @@ def test_film_shows_the_motion(tmp_path):
     for top, left in ((0, 0), (0, 160), (120, 0)):
         assert green(inner[0, top : top + 120, left : left + 160]) > 50
     moving = data["still"].astype(int)
-    assert green(moving[0]) == 0 and green(moving[2]) > 50, "the target moves away at the end"
+    there, away = green(moving[0]), green(moving[2])
+    assert 0 < there < away and away > 50, "seen around the robot, and moves away at the end"
     red = (inner[..., 0] > 180) & (inner[..., 1:] < 60).all(axis=-1)
     edge = {
         (top, left): red[:, top + 1, left + 30 : left + 130].all(axis=1)
@@ -438,7 +439,7 @@ def test_film_refuses_what_it_cannot_draw(tmp_path, monkeypatch, joint):
         with pytest.raises(ValueError, match=message):
             render(joint, states, **options)
     monkeypatch.setattr(mujoco, "Renderer", no_renderer)
-    with pytest.raises(RuntimeError, match="MUJOCO_GL=egl"):
+    with pytest.raises(RuntimeError, match=r"MUJOCO_GL=egl.*MuJoCo says: .*\w$"):
         render(joint, np.zeros((3, 2)))
     frames = np.zeros((2, 4, 4, 3), np.uint8)
     for name, given, message in (
@@ -449,6 +450,8 @@ def test_film_refuses_what_it_cannot_draw(tmp_path, monkeypatch, joint):
             save_video(tmp_path / name, given, 25)
     with pytest.raises(ValueError, match="fps: 0"):
         Film(frames, 0)
+    with pytest.raises(ValueError, match="path: is a ndarray. Give the path first"):
+        save_video(frames, "a.gif", 25)
     monkeypatch.setitem(sys.modules, "imageio", None)
     monkeypatch.setitem(sys.modules, "imageio.v3", None)
     with pytest.raises(ValueError, match=r"imageio\[ffmpeg\]"):

@@ -211,6 +211,18 @@ def test_tracking_without_an_end_cost():
     assert plan.cost <= near.cost
 
 
+def test_stages_without_weight_are_the_cause_that_is_named():
+    """Not R, which is positive: with three free stages u_0 and u_1 do whatever they like."""
+    system = jm.LinearSystem([[1.0, 0.1], [0.0, 1.0]], [[0.005], [0.1]])
+    weights = [0.0, 0.0, 0.0, 1.0, 1.0]
+    mpc = jm.MPC(system, np.eye(2), 0.1, horizon=5, stage_weights=weights)
+    with pytest.raises(
+        ValueError, match="stage_weights: is 0 at k = 0, .* Give stage 0 a positive"
+    ):
+        jm.Controller(mpc)
+    jm.Controller(replace(mpc, stage_weights=[1e-3, *weights[1:]]))
+
+
 @pytest.mark.slow
 def test_the_cure_for_a_singular_R_helps():
     mpc = without_effort()

@@ -224,7 +224,7 @@ class TestReport:
         assert np.isnan(report.loops.next_states[3]).all()
         assert report.loops.counts()["lost after one step"] == 2
         text = str(report)
-        assert "refuted" in text and "0.0474342" in text and "lost by any" in text
+        assert "refuted" in text and "0.0474342" in text and "lost, any input" in text
         data = report.to_xarray()
         assert data["lost_at"].shape == (5,) and data.attrs["steps"] == 4
 

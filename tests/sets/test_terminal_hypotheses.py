@@ -53,7 +53,7 @@ def test_terminal_set_of_the_joint_and_its_certificate():
         for j in range(2):
             image = exact.dot(H[i], [row[j] for row in closed])
             assert abs(exact.dot(weights, columns[j]) - image) <= Fraction(1, 10**14)
-    assert report.exact_factor <= 1 + Fraction(1, 10**14)
+    assert report.exact_factor <= 1 and "is at most 1" in report["invariance under K"].sentence
     # the ellipsoid of the same law
     ellipsoid = invariant_ellipsoid(
         JOINT, report.K, lqr(JOINT, np.diag([50.0, 1.0]), np.array([[0.1]])).P,
@@ -69,6 +69,18 @@ def test_terminal_set_of_the_joint_and_its_certificate():
     assert report["inputs of K admissible"].margin == pytest.approx(-2, abs=1e-12)
     assert report["control invariance"].holds is None and report.recursive_feasibility is None
     assert report.stability is False
+
+
+def test_rounding_takes_no_invariant_set_out_of_itself():
+    """The exact factor of sets whose rows round, under a load as in notebook 09."""
+    system = LinearSystem([[1, 0.05], [0, 0.7]], [[0.012], [0.43]])
+    states, inputs, load = symmetric(1.5, 2), symmetric(2), symmetric(0.6)
+    K = lqr(system, np.diag([50.0, 1.0]), [[2.0]]).K
+    for against in ({}, {"disturbance": load, "disturbance_matrix": system.B}):
+        X_f = maximal_invariant_set(system, K, states, inputs, **against)
+        Q, R = np.diag([50.0, 1.0]), np.array([[2.0]])
+        report = verify_terminal(system, Q, R, None, X_f, states, inputs, K, **against)
+        assert report["invariance under K"].holds and report.exact_factor <= 1
 
 
 def test_control_invariance_is_enough_for_theorem_1():
