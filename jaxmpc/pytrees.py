@@ -3,6 +3,8 @@ which stored programs (`jax.export`) know by name."""
 
 import ast
 import dataclasses
+import functools
+import inspect
 import textwrap
 from collections.abc import Callable, Iterable
 from typing import Any, TypeVar, dataclass_transform
@@ -11,7 +13,7 @@ import jax
 import numpy as np
 from jax import export
 
-from jaxmpc.checks import fail, shown
+from jaxmpc.checks import fail, nearest, shown
 
 T = TypeVar("T", bound=type)
 # Entries of an array that is printed as numbers, and characters of a field, at most.
@@ -30,9 +32,42 @@ def record(cls: T) -> T:
     """Make a frozen dataclass of a class, which compares by identity, and prints as `short_text`
     says unless it has a way of its own."""
     dataclasses.dataclass(cls, frozen=True, eq=False, repr=False)
+    cls.__init__ = _naming_arguments(cls.__init__)  # type: ignore[misc]
     if cls.__repr__ is object.__repr__:
         cls.__repr__ = short_text  # type: ignore[method-assign, assignment]
     return cls
+
+
+def _naming_arguments(make: Callable[..., None]) -> Callable[..., None]:
+    """Return a constructor that says of a wrong call which arguments there are."""
+    known = [p for p in inspect.signature(make).parameters.values() if p.name != "self"]
+
+    @functools.wraps(make)
+    def __init__(self: Any, *values: Any, **named: Any) -> None:
+        try:
+            make(self, *values, **named)
+        except TypeError:
+            _require_arguments(type(self).__name__, known, len(values), named)
+            raise
+
+    return __init__
+
+
+def _require_arguments(
+    name: str, known: list[inspect.Parameter], values: int, named: Iterable[str]
+) -> None:
+    """Raise TypeError where a class is called with an argument that it does not have, or without
+    one that it needs. values: how many arguments have no name."""
+    names = [p.name for p in known]
+    takes = f"{name} takes {', '.join(names)}"
+    for word in named:
+        if word not in names:
+            near = nearest(word, names)
+            raise TypeError(f"{name}: there is no argument {word}. {near}{takes}") from None
+    needed = [p.name for p in known[values:] if p.default is p.empty and p.name not in named]
+    if needed:
+        missing = f"{name}: {', '.join(needed)} {'is' if len(needed) == 1 else 'are'} missing"
+        raise TypeError(f"{missing}. {takes}") from None
 
 
 @dataclass_transform(eq_default=False, frozen_default=True, field_specifiers=(static,))

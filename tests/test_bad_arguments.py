@@ -1,12 +1,15 @@
 """Wrong arguments in Python: ValueError in one line that names the argument, before any compile.
 What has one meaning is accepted: numbers and vectors where a matrix is needed."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxmpc as jm
+from jaxmpc.pytrees import record
 
 A, B = np.array([[1, 0.01], [0, 1]]), np.array([[0], [0.2]])
 S = jm.LinearSystem(A, B, dt=0.01)
@@ -703,3 +706,67 @@ def test_rebuilt_objects_stay_what_they_are():
     np.testing.assert_array_equal(system, [[1], [1]])
     box = jax.jit(lambda u: mpc(states=jm.Box(-1.0, u)).states.upper)(2.0)
     np.testing.assert_array_equal(box, [2, 2])
+
+
+@pytest.mark.parametrize(
+    "message, call",
+    [
+        ("MPC: there is no argument u_min. MPC takes system, Q, R", lambda: mpc(u_min=-1)),
+        ("LinearSystem: there is no argument C. LinearSystem", lambda: jm.LinearSystem(A, B, C=A)),
+        ("LinearSystem: there is no argument state_name. Did you mean state_names?",
+         lambda: jm.LinearSystem(A, B, state_name=("q", "v"))),
+        ("ADMM: there is no argument iteration. Did you mean iterations?",
+         lambda: jm.ADMM(iteration=3)),
+        ("QP: A, l, u are missing. QP takes P, q, A, l, u,", lambda: jm.QP(np.eye(2), x)),
+        ("QP: u is missing.", lambda: jm.QP(np.eye(2), x, A, l=x)),
+        ("MPC: there is no argument horizons. Did you mean horizon?",
+         lambda: dataclasses.replace(M, horizons=4)),
+    ],
+)  # fmt: skip
+def test_arguments_that_do_not_exist_or_are_missing(message, call):
+    with pytest.raises(TypeError) as told:
+        call()
+    assert str(told.value).startswith(message)
+
+
+def test_errors_inside_a_constructor_stay_what_they_are():
+    @record
+    class Sized:
+        of: list
+
+        def __post_init__(self):
+            len(self.of)
+
+    with pytest.raises(TypeError, match="has no len"):
+        Sized(of=3)
+    with pytest.raises(TypeError, match="takes 2 positional arguments but 3 were given"):
+        Sized([], [])
+
+
+@pytest.mark.parametrize(
+    "message, call",
+    [
+        ("Polytope.h: shape (2,) where (1,) is", lambda: jm.Polytope([[1.0, 0.0]], [1.0, 2.0])),
+        ("Polytope.labels: 1 entries for 2 rows", lambda: jm.Polytope(np.eye(2), x, ("a",))),
+        ("Box.upper: shape (3,) where (2,) is", lambda: jm.Box([1, 2], [3, 4, 5])),
+        ("Zonotope.generators: shape (1, 3) is not", lambda: jm.sets.Zonotope(x, [[1, 2, 3]])),
+        ("Ellipsoid.P: shape (2, 3) is not (n, n)", lambda: jm.Ellipsoid(np.ones((2, 3)), 1.0)),
+        ("Ellipsoid.center: shape (3,) where", lambda: jm.Ellipsoid(np.eye(2), 1, [1, 2, 3])),
+    ],
+)
+def test_sets_of_wrong_shapes_are_refused_when_they_are_made(message, call):
+    with pytest.raises(ValueError) as told:
+        call()
+    assert str(told.value).startswith(message)
+
+
+def test_batches_of_sets_and_their_axes_are_made():
+    """What JAX makes has no shape of one set."""
+    many = jm.Polytope(np.ones((4, 3, 2)), np.ones((4, 3)))
+    axes = jm.Polytope(H=0, h=None)
+    one = jm.Polytope(np.ones((3, 2)), np.ones(3))
+    assert jax.vmap(lambda p: p.H.sum(), in_axes=(axes,))(
+        jm.Polytope(many.H, one.h)
+    ).shape == (4,)  # fmt: skip
+    last = jax.vmap(lambda p: p, out_axes=-1)(many)
+    assert (last.H.shape, last.h.shape) == ((3, 2, 4), (3, 4))

@@ -152,59 +152,64 @@ class CriticalRegions:
         return len(self.free) < self.problem.dimension
 
     def find(self, x0s: Reals, tolerance: float = 1e-9) -> np.ndarray:
-        """Return the index (B,) of the region that holds each θ of x0s (B, p), −1 where none does.
+        """Return the index of the region that holds θ (p,), −1 where none does, or (B,) of each θ
+        of x0s (B, p).
 
         tolerance: how far outside all regions a θ may lie, relative to the width of X_N across
         the facet that it exceeds.
         """
-        x = self._states(x0s)
+        x, shape = self._states(x0s)
         H, h, starts = self.facets
         answer = np.full(len(x), -1)
         finite = np.flatnonzero(np.all(np.isfinite(x), axis=1))
         if not len(h):  # one region that is all of R^p
             answer[finite] = 0
-            return answer
+            return answer.reshape(shape)
         for i in range(0, len(finite), 256):
             chunk = finite[i : i + 256]
             beyond = np.maximum.reduceat((x[chunk] @ H.T - h) / self._widths, starts, axis=1)
             near = beyond.min(axis=1) <= tolerance
             answer[chunk] = np.where(near, beyond.argmin(axis=1), -1)
-        return answer
+        return answer.reshape(shape)
 
     def plan(self, x0s: Reals) -> np.ndarray:
-        """Return optimal z (B, nz) at the parameters x0s (B, p); NaN where no region holds them."""
+        """Return optimal z (nz,) at parameters θ (p,), or (B, nz) at x0s (B, p); NaN where no
+        region holds them."""
         return self._evaluate(x0s, [(region.Z, region.z0) for region in self.regions])
 
     def law(self, x0s: Reals) -> np.ndarray:
-        """Return the law (B, m) at the parameters x0s (B, p): first inputs u_0 of an MPC; NaN where
-        no region holds them."""
+        """Return the law (m,) at parameters θ (p,), or (B, m) at x0s (B, p): first inputs u_0 of an
+        MPC; NaN where no region holds them."""
         return self._evaluate(x0s, [(region.K, region.k) for region in self.regions])
 
     def value(self, x0s: Reals) -> np.ndarray:
-        """Return the least cost (B,) at the parameters x0s (B, p), NaN where no region holds them:
-        a piecewise quadratic function."""
-        x, where = self._states(x0s), self.find(x0s)
+        """Return the least cost at parameters θ (p,), or (B,) at x0s (B, p), NaN where no region
+        holds them: a piecewise quadratic function."""
+        x, shape = self._states(x0s)
+        where = self.find(x)
         values = np.full(len(x), np.nan)
         for i in np.unique(where[where >= 0]):
             region, here = self.regions[i], x[where == i]
             values[where == i] = (here @ region.V / 2 * here).sum(axis=1) + here @ region.v
             values[where == i] += region.v0
-        return values
+        return values.reshape(shape)
 
     def _evaluate(self, x0s: Reals, laws: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
         """Return gain x + offset of the region that holds each θ."""
-        x, where = self._states(x0s), self.find(x0s)
+        x, shape = self._states(x0s)
+        where = self.find(x)
         values = np.full((len(x), len(laws[0][1])), np.nan)
         for i in np.unique(where[where >= 0]):
             gain, offset = laws[i]
             values[where == i] = x[where == i] @ gain.T + offset
-        return values
+        return values.reshape(*shape, -1)
 
-    def _states(self, x0s: Reals) -> np.ndarray:
+    def _states(self, x0s: Reals) -> tuple[np.ndarray, tuple[int, ...]]:
+        """Return parameters as rows (B, p), and the shape of one number for each: () or (B,)."""
         x, p = np.asarray(x0s, np.float64), self.problem.dimension
-        if x.ndim != 2 or x.shape[1] != p:
-            fail("x0s", f"shape {x.shape}", f"Give states (B, {p})")
-        return x
+        if x.ndim not in (1, 2) or x.shape[-1] != p:
+            fail("x0s", f"shape {x.shape}", f"Give one state ({p},) or states (B, {p})")
+        return np.atleast_2d(x), x.shape[:-1]
 
     @cached_property
     def facets(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

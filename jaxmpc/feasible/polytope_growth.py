@@ -16,6 +16,12 @@ from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope
 from jaxmpc.sets.geometry import unit_rows
 from jaxmpc.sets.predecessors import predecessor
 
+# Why the facets of problems of many states with limited rates are not found, and what helps.
+RATES = (
+    "in more than four dimensions its facets are enumerated for limits of states and inputs alone. "
+    "Make u_{k-1} a state and its change the input, as in docs/theory/recursive-feasibility.md"
+)
+
 
 def feasible_polytope(mpc: MPC) -> Polytope:
     """Return the feasible set X_N as a polytope, every facet once: {θ : some plan keeps every hard
@@ -117,6 +123,8 @@ def backward(
     last: Any = mpc.terminal_set
     if mpc.disturbance is not None:
         return "in more than four dimensions the facets of a robust problem are not enumerated"
+    if mpc.rate_limited:
+        return RATES
     if (
         not is_standard_form(mpc)
         or not mpc.constrain_initial

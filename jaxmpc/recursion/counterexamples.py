@@ -118,6 +118,7 @@ class SampledLoops:
     first input and where it leads (NaN where label ≠ 1). lost_at (B,): first step k ≥ 1 of the
     closed loop at which the problem is proved infeasible; 0: feasible at all steps; −1: not proved
     feasible at the start; −2: undecided, from step undecided_at (B,) on (0 elsewhere).
+    late_at: the step before which the time was over, None: it was not.
     """
 
     x0s: np.ndarray
@@ -127,6 +128,7 @@ class SampledLoops:
     lost_at: np.ndarray
     undecided_at: np.ndarray
     steps: int
+    late_at: int | None = None
 
     @classmethod
     def undecided(cls, problem: FeasibilityProblem, x0s: np.ndarray, steps: int) -> "SampledLoops":
@@ -165,6 +167,19 @@ class SampledLoops:
             "undecided": int(np.sum(lost == UNDECIDED)),
         }
 
+    def why_undecided(self) -> str:
+        """Return why loops are undecided, "" where none is."""
+        at = self.undecided_at[self.lost_at == UNDECIDED]
+        late = int(np.sum(at == self.late_at))
+        causes = []
+        if late:
+            causes.append(
+                f"{late:,}: the time was over before step {self.late_at}; give more seconds"
+            )
+        if late < len(at):
+            causes.append(f"{len(at) - late:,}: no plan was SOLVED, or the next state has no proof")
+        return "; ".join(causes)
+
 
 def labelled(law: Law, problem: FeasibilityProblem, states: np.ndarray) -> Labels:
     """Return the labels of states (B, p or more columns), in programs of the law's shape."""
@@ -197,7 +212,7 @@ def closed_loops(
             break
         if not budget.affords(0):
             lost_at[alive], undecided_at[alive] = UNDECIDED, k
-            break
+            return replace(loops, late_at=k)
         plans = law.plans(states[alive])
         u = law.limited(plans.inputs[:, 0])
         x = law.following(states[alive], u)

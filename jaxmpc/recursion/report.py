@@ -74,7 +74,8 @@ class RecursionReport:
             rows.append(("samples", f"{len(self.loops.x0s):>10,}  of {self.loops.steps} steps"))
             rows.append(("- feasible", f"{feasible:>10,}"))
             for name, count in counts.items():
-                share = f"{count / max(feasible, 1):8.3%} of the feasible"
+                why = f" ({self.loops.why_undecided()})" if name == "undecided" and count else ""
+                share = f"{count / max(feasible, 1):8.3%} of the feasible{why}"
                 rows.append((f"- {name}", f"{count:>10,}  {share}"))
         else:
             why = "its law is proved" if self.law.holds else "no time was left for them"

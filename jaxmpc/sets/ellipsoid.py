@@ -47,6 +47,7 @@ class Ellipsoid(BasicSet):
 
     def __post_init__(self) -> None:
         store_floats(self, "P", "level", "center")
+        self._require_given(P=2, level=0)
 
     @property
     def dimension(self) -> int:

@@ -185,6 +185,7 @@ class Polytope(LinearSet):
 
     def __post_init__(self) -> None:
         store_floats(self, "H", "h")
+        self._require_given(H=2, h=1)
 
     @classmethod
     def from_points(cls, points: Reals) -> "Polytope":
@@ -612,6 +613,7 @@ class Box(LinearSet):
         if axes in ((0, 1), (1, 0), (0, 2), (2, 0)):
             one, other = ("lower", "upper") if axes[0] == 0 else ("upper", "lower")
             self._fill(one, np.shape(as_array(getattr(self, other)))[-1:])
+        self._require_given(lower=1, upper=1)
 
     def _fill(self, name: str, shape: tuple[int, ...]) -> None:
         value = getattr(self, name)
@@ -917,6 +919,7 @@ class Zonotope(LinearSet):
 
     def __post_init__(self) -> None:
         store_floats(self, "center", "generators")
+        self._require_given(center=1, generators=2)
 
     @classmethod
     def from_box(cls, box: Box) -> "Zonotope":

@@ -40,6 +40,14 @@ class ConvexSet(ABC):
     def _require_fields(self, argument: str, dimension: int | None = None) -> None:
         """Raise ValueError, naming `argument`, for fields of wrong shapes."""
 
+    def _require_given(self, **axes: int) -> None:
+        """Raise ValueError for fields of wrong shapes where a user gave them: as numbers or arrays
+        of NumPy, with the axes of one set. What JAX rebuilds holds its arrays, or placeholders."""
+        values = [(getattr(self, name), count) for name, count in axes.items()]
+        plain = (np.ndarray, float, int)
+        if all(isinstance(v, plain) and np.ndim(v) == count for v, count in values):
+            self._require_fields(type(self).__name__)
+
 
 class BasicSet(ConvexSet):
     """A convex set that can be written with operators: Box, Polytope, Zonotope or Ellipsoid."""

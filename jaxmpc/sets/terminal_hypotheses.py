@@ -91,6 +91,7 @@ class TerminalReport:
             missing = [c.name for c in self.checks if number in c.theorems and not c.holds]
             answer = f"does not apply: {', '.join(missing)}" if missing else "applies"
             lines.append(f"Theorem {number} ({title}) {answer}.")
+        lines.append("Limits of input rates, outputs and blocked moves are no part of either.")
         return "\n".join(lines)
 
     def __str__(self) -> str:
@@ -123,7 +124,9 @@ def verify_terminal(
     is control invariant, a feasible MPC problem stays feasible along its own closed loop.
     Theorem 3. If in addition, on X_f, u = K x keeps x in X_f and u in U, and
     (A+BK)'P(A+BK) - P + Q + K'RK <= 0, the origin is asymptotically stable on X_N.
-    Both are stated for w = 0. With a disturbance, robust invariance is checked.
+    Both are stated for w = 0. With a disturbance, robust invariance is checked. Limits of input
+    rates, outputs and blocked moves are no part of either: with limited rates let the state be (x,
+    u_{k−1}) and the input its change, and give that system, whose limits are those of a set.
 
     Arguments:
         system: x+ = A x + B u + c.

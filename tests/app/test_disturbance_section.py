@@ -106,6 +106,19 @@ def test_simulate_command(tmp_path, monkeypatch, policy, capsys):
     assert moved.sum() == summary["planned"]
 
 
+@pytest.mark.slow
+def test_simulate_with_limited_rates(tmp_path, monkeypatch):
+    """Loops begin with an input of zero, and no input changes by more than the limit."""
+    monkeypatch.chdir(tmp_path)
+    limited = TEXT.replace("[cost]", "input_rate_limit = 0.3\n[cost]").replace("0.2", "0.05")
+    (tmp_path / "problem.toml").write_text(limited.replace('"invariant"', '"none"'))
+    options = "problem.toml --disturbance worst --output out"
+    assert main([*LOOPS.split(), *options.split()]) in (0, None)
+    runs = np.load(tmp_path / "out/runs.npz")
+    changes = np.diff(runs["inputs"], axis=1, prepend=0.0)
+    assert runs["inputs"].shape == (8, 4, 1) and 0.25 < np.abs(changes).max() <= 0.3 + 1e-12
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -152,4 +152,15 @@ class TestRegions:
         with pytest.raises(ValueError, match="within"):
             critical_regions(mpc, within=np.ones(2))
         with pytest.raises(ValueError, match="x0s: shape"):
-            critical_regions(mpc).law(np.zeros(2))
+            critical_regions(mpc).law(np.zeros(3))
+
+    def test_one_state_is_as_good_as_many(self):
+        """Numbers and vectors at θ (p,), each that of the batch; nowhere counts too."""
+        found = critical_regions(problems.lecture(0.25, 2))
+        x0s = np.array([[0.3, -0.2], [0.9, 0.1], [5.0, 5.0]])
+        for ask in (found.find, found.law, found.plan, found.value):
+            many = ask(x0s)
+            for x0, one in zip(x0s, many, strict=True):
+                assert np.shape(ask(x0)) == np.shape(one)
+                np.testing.assert_allclose(ask(x0), one, rtol=1e-14)
+        assert found.law(x0s[0]).shape == (1,) and found.find(x0s[2]) == -1

@@ -8,6 +8,7 @@ import exact
 import numpy as np
 import problems
 import pytest
+from scipy.optimize import linprog
 
 import jaxmpc as jm
 from jaxmpc.explicit.law_at_states import RegionLaw
@@ -24,7 +25,7 @@ from jaxmpc.recursion import (
 from jaxmpc.recursion import (
     counterexamples as search,
 )
-from jaxmpc.recursion.counterexamples import closed_loops
+from jaxmpc.recursion.counterexamples import SampledLoops, closed_loops
 from jaxmpc.recursion.proofs import _by_theorem, settle_claims
 from jaxmpc.recursion.time_budget import Budget
 
@@ -32,6 +33,20 @@ from jaxmpc.recursion.time_budget import Budget
 def settled(mpc):
     """The claims as theorems and linear programs settle them."""
     return settle_claims(mpc, FeasibilityProblem.of(mpc))
+
+
+def has_plan(A, B, point, u_limit, rate) -> bool:
+    """Whether (x, u_{-1}) has two inputs within limits and rates, |x_0|, |x_1| <= 1, by an LP."""
+    (n, m), x = np.shape(B), point[: len(B)]
+    one, none = np.eye(m), np.zeros((m, m))
+    rows = np.block([[B, np.zeros((n, m))], [one, none], [-one, one]])
+    middle = np.concatenate([-A @ x, point[n:], np.zeros(m)])
+    width = np.concatenate([np.ones(n), np.full(2 * m, rate)])
+    found = linprog(
+        np.zeros(2 * m), np.vstack([rows, -rows]), np.append(middle + width, width - middle),
+        bounds=[(-u_limit, u_limit)] * (2 * m),
+    )  # fmt: skip
+    return bool(np.abs(x).max() <= 1) and found.status == 0
 
 
 def holds(found) -> tuple:
@@ -120,6 +135,31 @@ class TestProofs:
         assert len(found.feasible_set.offsets) == len(body.facets)
         ends = [float(body.support(normal)) for normal in found.feasible_set.normals]
         np.testing.assert_allclose(found.feasible_set.offsets, ends, atol=1e-9)
+
+    def test_limited_rates_name_a_cure_that_helps(self):
+        """Facets in five dimensions: with rates as inputs they are found, the same as without."""
+        n, m, u = 3, 2, 0.4
+        A, B = np.eye(n) + 0.8 * np.eye(n, k=1), np.eye(n)[:, :m]
+        x, rate = jm.Box(-np.ones(n), np.ones(n)), jm.Box(-0.3 * np.ones(m), 0.3 * np.ones(m))
+        limits = {"states": x, "inputs": jm.Box(-u * np.ones(m), u * np.ones(m))}
+        mpc = jm.MPC(
+            jm.LinearSystem(A, B), np.ones(n), np.ones(m), 2, **limits,
+            input_rate_limit=0.3 * np.ones(m),
+        )  # fmt: skip
+        with pytest.raises(ValueError, match=r"Make u_\{k-1\} a state.*recursive-feasibility.md"):
+            jm.feasible_polytope(mpc)
+        assert "Make u_{k-1} a state" in settled(mpc).strong.reason
+        A = np.block([[A, B], [np.zeros((m, n)), np.eye(m)]])
+        system = jm.LinearSystem(A, np.vstack([B, np.eye(m)]))
+        box = jm.Box(*(s * np.append(np.ones(n), u * np.ones(m)) for s in (-1, 1)))
+        within = jm.Box(*(s * np.append(np.full(n, np.inf), u * np.ones(m)) for s in (-1, 1)))
+        moved = jm.MPC(
+            system, np.ones(n + m), np.ones(m), 2, states=box, inputs=rate, terminal_set=within
+        )
+        body = jm.feasible_polytope(moved)
+        points = np.random.default_rng(0).uniform(-1, 1, (40, n + m)) * [1, 1, 1, u, u]
+        planned = [has_plan(A[:n, :n], B, point, u, 0.3) for point in points]
+        assert body.contains(points).tolist() == planned and 5 < sum(planned) < 35
 
     def test_reasons_name_the_proof_and_the_counterexample(self):
         reason = settled(problems.joint(6)).strong.reason
@@ -317,6 +357,19 @@ class TestReport:
         loops = closed_loops(law, problem, states, labels, 5, over)
         np.testing.assert_array_equal(loops.lost_at, [-2, -2, -1])
         np.testing.assert_array_equal(loops.undecided_at, [1, 1, 0])
+        assert loops.late_at == 1
+        assert loops.why_undecided() == "2: the time was over before step 1; give more seconds"
+
+    def test_undecided_loops_say_why(self):
+        """Those that the time ended, and those that a plan or a label left open before."""
+        problem = FeasibilityProblem.of(problems.lecture())
+        loops = SampledLoops.undecided(problem, np.zeros((5, 2)), 5)
+        at = {"lost_at": np.array([-2, -2, -2, 0, -1]), "undecided_at": np.array([3, 1, 3, 0, 0])}
+        open_ones = "1: no plan was SOLVED, or the next state has no proof"
+        late = "2: the time was over before step 3; give more seconds"
+        assert replace(loops, **at, late_at=3).why_undecided() == f"{late}; {open_ones}"
+        assert replace(loops, **at).why_undecided() == f"3{open_ones[1:]}"
+        assert loops.why_undecided() == ""
 
     @pytest.mark.parametrize(
         ("arguments", "message"),

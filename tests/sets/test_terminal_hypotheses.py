@@ -39,7 +39,8 @@ def test_terminal_set_of_the_joint_and_its_certificate():
     assert report.recursive_feasibility is True and report.stability is True
     assert all(check.holds for check in report.checks)
     assert "Theorem 1 (recursive feasibility) applies." in str(report)
-    assert len(str(report).splitlines()) == 2 + 2 * len(report.checks)
+    assert "Limits of input rates, outputs and blocked moves are no part of either." in str(report)
+    assert len(str(report).splitlines()) == 3 + 2 * len(report.checks)
     # M >= 0, M H = H (A + BK), M h <= h, in rationals; the set's rows were rounded themselves
     M, H, h, A, B, K = (
         exact.rational(part)

@@ -85,8 +85,6 @@ def simulate_problem(loops: LinearLoops, output: Path, overwrite: bool) -> None:
     mpc = config.build_controlled()
     if mpc.disturbance is None and loops.disturbance is not None:
         fail("--disturbance", f"{loops.disturbance}, and the file has none", "Add [disturbance]")
-    if mpc.input_in_state:
-        fail("limits.input_rate_limit", "given", "Loops of problem files start without an input")
     each = 8 * (3 * mpc.system.n + mpc.system.m + 4) * loops.steps
     require_memory("--count, --seconds", loops.count * each, "Simulate fewer loops, or less time")
     x0s = loops.starts()
