@@ -234,7 +234,7 @@ CALLS = [
     ("inputs: has dimension 2 where 1 is", lambda: mpc(inputs=jm.Box([-1, -1], [1, 1])).validate()),
     ("inputs: is a str. Give a Box or Polytope,", lambda: mpc(inputs="box").validate()),
     (
-        "states.h: shape (2,) where (1,) is needed.",
+        "Polytope.h: shape (2,) where (1,) is needed.",
         lambda: mpc(states=jm.Polytope([[1, 0]], [1, 2])).validate(),
     ),
     (

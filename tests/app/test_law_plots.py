@@ -27,6 +27,17 @@ def test_polygons_fill_the_set():
     assert plot_regions(regions, show="value").get_xlabel() == "x1"
 
 
+def test_the_colour_bar_says_what_it_measures_beside_the_axes():
+    system = jm.LinearSystem([[1, 1], [0, 1.0]], [0.5, 1], input_names=("F",), input_units=("N",))
+    regions = critical_regions(jm.MPC(system, [1.0, 1], 0.1, 2, X, U))
+    for show, label in (("law", "first input F [N]"), ("value", "least cost")):
+        ax = plot_regions(regions, show=show)
+        bar = ax.figure.axes[1]
+        assert bar.get_ylabel() == label and ax.get_legend() is None
+        ax.figure.draw_without_rendering()
+        assert 0 < bar.get_position().x0 - ax.get_position().x1 < 0.03
+
+
 def test_slices_and_unbounded_sets():
     qp = ParametricQP(np.eye(2), np.eye(2), [1.0, 1], F=-np.eye(2, 3), S=np.zeros((2, 3)),
                       names=("a", "b", "c"))  # fmt: skip

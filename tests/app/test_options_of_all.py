@@ -12,6 +12,7 @@ import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 import jaxmpc as jm
@@ -20,7 +21,7 @@ from jaxmpc.app.commands import info, init, sweep
 from jaxmpc.app.options.shared import Everywhere
 from jaxmpc.app.plots import plot_body
 from jaxmpc.app.plots.maps import finish, new_axes
-from jaxmpc.app.plots.style import save
+from jaxmpc.app.plots.style import FEASIBLE, UNDECIDED, save
 from jaxmpc.recursion.proofs import Claim
 from jaxmpc.verify.stored_map import Verification
 from jaxmpc.workflow.offline_checks import NominalLoops, OfflineReport
@@ -162,7 +163,8 @@ def test_pictures_in_another_format(tmp_path, monkeypatch, capsys):
         assert cli.main(["init", "--format", name]) == 0
         assert {found.suffix for found in tmp_path.iterdir()} == {".png"} | others
         if name == "pdf":
-            assert path.with_suffix(".pdf").read_bytes().startswith(b"%PDF")
+            data = path.with_suffix(".pdf").read_bytes()
+            assert data.startswith(b"%PDF") and b"/Type3" not in data and b"CIDFontType2" in data
         matplotlib.rcParams["savefig.format"] = "png"
 
 
@@ -174,14 +176,24 @@ def test_pictures_for_a_column(tmp_path, monkeypatch):
 
     def run(self):
         ax = new_axes()
-        ax.plot([0, 1], [0, 1], label="line")
-        finish(ax, ["a [m]", "b [m]"], "A title", ax.lines[:])
+        for words in ("line", "a line of which many words are said", "another of as many words"):
+            ax.plot([0, 1], [0, 1], label=words)
+        finish(ax, ["a [m]", "b [m]"], f"A title\nslice at {', '.join(values)}", ax.lines[:])
         save(ax.figure, path)
+        title, legend = ax._left_title, ax.get_legend()
+        first, second = title.get_text().splitlines()[:2]
+        assert first == "A title" and second.endswith("[rad] = 0.25,")
+        for text in (title, legend):
+            box = text.get_window_extent()
+            assert 0 <= box.x0 and box.x1 <= ax.figure.bbox.x1 and box.y0 >= 0
 
+    values = [f"q{i} [rad] = 0.25" for i in range(1, 6)]
     monkeypatch.setattr(init.Init, "run", run)
-    assert cli.main(["init", "--width", "column"]) == 0
-    width = plt.imread(path).shape[1] / 150
-    assert 3.0 < width < 3.9
+    assert cli.main(["init", "--width", "column", "--format", "pdf"]) == 0
+    image = plt.imread(path)
+    assert image.shape[1] == 3.5 * 150
+    assert np.all(image[:3, :, :3] == 1) and np.all(image[-3:, :, :3] == 1)  # nothing is cut off
+    assert b"/MediaBox [ 0 0 252 " in path.with_suffix(".pdf").read_bytes()
     assert cli.main(["init", "--width", "poster"]) == 2
 
 
@@ -198,6 +210,11 @@ def test_three_states_are_a_body_and_its_projections():
         line = ax.lines[0].get_xydata()
         np.testing.assert_allclose(line.max(axis=0), np.array([3, 2, 1])[[i, j]], atol=1e-6)
     assert figure.axes[0].collections
+    for ax in figure.axes[1:]:  # filled to the outer bound, and on top to the inner one
+        assert [area.get_facecolor()[:3] for area in ax.patches] == [
+            to_rgb(UNDECIDED), to_rgb(FEASIBLE)
+        ]  # fmt: skip
+    assert figure.legends[0].get_texts()[1].get_text() == "inner bound (100.0% of it)"
     with pytest.raises(ValueError, match="2 states"):
         plot_body(jm.map_feasible_set(mpc, np.zeros((1, 2)), axes=(0, 1), fixed=np.zeros(3)))
 

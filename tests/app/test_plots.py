@@ -3,13 +3,16 @@
 import dataclasses
 from types import SimpleNamespace
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from panels import require_no_empty_panel
 
 from jaxmpc.app.plots import plot_body, plot_feasible_set, plot_recursion, plot_robot_map
 from jaxmpc.app.plots.closed_loops import plot_before_after, plot_runs
+from jaxmpc.app.plots.style import FEASIBLE, INFEASIBLE
 from jaxmpc.app.plots.tuning import plot_maps, plot_solver, plot_tuning
 from jaxmpc.closed_loop.simulation import Run
 from jaxmpc.recursion.counterexamples import Counterexample, SampledLoops
@@ -84,6 +87,43 @@ def test_grid_becomes_an_image_with_first_state_to_the_right():
     ]
     reach = [np.abs(line.get_xdata()).max() for line in ax.lines]
     np.testing.assert_allclose(reach, [0.5, 1.2, 1.0])
+
+
+def test_cells_end_at_the_bounds(tmp_path):
+    """Beyond the outer bound the picture is grey, inside the inner one blue, whatever the cells."""
+    ax = plot_feasible_set(Map(square(7)))  # cells of 2/3: one of a feasible state reaches to 1/3
+    ax.figure.set_layout_engine("none")
+    ax.figure.savefig(tmp_path / "map.png", dpi=100)
+    image = plt.imread(tmp_path / "map.png")[::-1, :, :3]
+    for x, colour in ((0.2, FEASIBLE), (0.9, FEASIBLE), (1.3, INFEASIBLE)):
+        for point in ((x, 0.1), (-x, 0.1), (0.1, x), (0.1, -x)):
+            column, row = ax.transData.transform(point).astype(int)
+            np.testing.assert_allclose(image[row, column], to_rgb(colour), atol=0.01)
+
+
+def test_set_points_over_time_and_titles():
+    """One a sample, drawn as steps; two inputs beside three states fill the same height."""
+    system = LinearSystem(np.eye(3), np.ones((3, 2)), dt=0.5)
+    box = lambda size: Box(-2 * np.ones(size), 2 * np.ones(size))
+    plant = LinearPlant(system, box(3), box(2))
+    reference = np.zeros((9, 3))
+    reference[4:] = 1.0
+    zeros = np.zeros((1, 6))
+    run = Run(np.zeros((1, 7, 3)), np.zeros((1, 6, 2)), *[zeros] * 6)
+    figure = plot_runs(run, plant, reference=reference, input_reference=np.ones((6, 2)), title="T")
+    assert figure.get_suptitle() == "T"
+    for ax, jump in zip(figure.axes, (2.0,) * 3 + (None,) * 2, strict=True):
+        x, y = ax.lines[-1].get_xydata().T
+        assert (x[0], x[-1]) == (0.0, 3.0)
+        np.testing.assert_array_equal(y, 1.0 if jump is None else x >= jump)
+    figure.draw_without_rendering()
+    for column in (figure.axes[:3], figure.axes[3:]):
+        heights = [ax.get_window_extent() for ax in column]
+        gaps = [above.y0 - below.y1 for above, below in zip(heights, heights[1:], strict=False)]
+        assert max(gaps) < 0.1 * figure.bbox.height
+    ends = [(c[0].get_window_extent().y1, c[-1].get_window_extent().y0)
+            for c in (figure.axes[:3], figure.axes[3:])]  # fmt: skip
+    np.testing.assert_allclose(*ends, atol=1.0)
 
 
 def test_scattered_points_slice_and_projection(tmp_path):

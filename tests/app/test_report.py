@@ -93,3 +93,7 @@ def test_a_picture_has_the_name_of_its_system(tmp_path):
     figure.axes[0].set_title("Feasible initial states", loc="left")
     save(figure, tmp_path / "a.png", "joint")
     assert figure.axes[0].get_title(loc="left") == "joint: feasible initial states"
+    figure.suptitle("Of all panels")
+    save(figure, tmp_path / "a.png", "joint")
+    assert figure.get_suptitle() == "joint: of all panels"
+    assert figure.axes[0].get_title(loc="left") == "joint: feasible initial states"

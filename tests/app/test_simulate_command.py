@@ -311,7 +311,7 @@ def test_runs_with_orientations_and_of_linear_plants(tmp_path):
     run = by_hand(np.zeros((1, 6, 3)), np.zeros((1, 5, 2)))
     run = jax.tree.map(lambda v: v[0], run)  # without a batch axis
     figure = plot_runs(run, plant)
-    assert [ax.get_ylabel() for ax in figure.axes if ax.axison] == ["a", "u1", "b", "u2", "c"]
+    assert [ax.get_ylabel() for ax in figure.axes if ax.axison] == ["a", "b", "c", "u1", "u2"]
 
 
 FILM = """

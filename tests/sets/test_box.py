@@ -54,7 +54,7 @@ def test_sets_pass_under_jit_and_grad():
         (Box([0, 0], [1, -1]), r"states: is empty: lower\[1\] = 0, upper\[1\] = -1"),
         (Box([INF, 0], [INF, 1]), "states: is empty"),
         (Box([-1, np.nan], [1, 1]), "states.lower: holds NaN"),
-        (Box([-1, 0], [1]), "states.upper: shape"),
+        (Box(jnp.array([-1.0, 0]), jnp.ones(1)), "states.upper: shape"),
         (Box(-1, 1), "states: has dimension 1 where 2"),
         (Box([-1], [1]), "states: has dimension 1 where 2"),
         (Box(None, [1]), "states.lower: None"),

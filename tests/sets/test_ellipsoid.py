@@ -3,6 +3,7 @@
 import math
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -54,7 +55,7 @@ def test_ellipse_boundary():
 @pytest.mark.parametrize(
     ("ellipsoid", "message"),
     [
-        (Ellipsoid(np.ones((2, 3)), 1.0), r"X_f.P: shape \(2, 3\) is not \(n, n\)"),
+        (Ellipsoid(jnp.ones((2, 3)), 1.0), r"X_f.P: shape \(2, 3\) is not \(n, n\)"),
         (Ellipsoid([[1, 2], [0.5, 1]], 1.0), "X_f.P: is not symmetric"),
         (Ellipsoid([[1, 2], [0, 1]], 1.0), "X_f.P: is triangular, not symmetric"),
         (Ellipsoid([[1, 2], [2, 1]], 1.0), "X_f.P: is not positive definite"),

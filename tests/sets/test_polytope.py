@@ -8,6 +8,7 @@ import itertools
 import math
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from polytopes import assert_same_points, cube, unimodular
@@ -170,7 +171,7 @@ def test_duality_and_linear_programs_agree(n):
         (Polytope([[1, 0]], [-INF]), "terminal_set: is empty"),
         (Polytope([[1, np.nan]], [1]), "terminal_set.H: holds"),
         (Polytope([[1, 0]], [np.nan]), "terminal_set.h: holds NaN"),
-        (Polytope([[1, 0]], [1, 2]), "terminal_set.h: shape"),
+        (Polytope(jnp.eye(2)[:1], jnp.ones(2)), "terminal_set.h: shape"),
         (Polytope([1, 0], [1]), "terminal_set.H: shape"),
         (Polytope([[1, 0, 0]], [1]), "terminal_set: has dimension 3 where 2"),
     ],

@@ -236,7 +236,7 @@ def test_terminal_errors(changes, message):
 
 def test_results_print_in_a_few_lines():
     report = scalar_report(K=[[0.75]])
-    assert repr(report).splitlines() == str(report).splitlines()[:2]
+    assert repr(report).splitlines() == str(report).splitlines()[:3]
     assert "invariance under K" in repr(report).splitlines()[1]
     system = LinearSystem([[0.5]], [[1.0]])
     found = maximal_invariant_set(system, [[0.25]], symmetric(1), symmetric(1))

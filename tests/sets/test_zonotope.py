@@ -115,7 +115,7 @@ def test_a_tube_of_twelve_states_and_jax():
     [
         ([[0.0]], [[1.0]], r"W.center: shape \(1, 1\) is not \(n,\)"),
         ([0.0, 0.0], [1.0, 1.0], r"W.generators: shape \(2,\) is not \(2, m\)"),
-        ([0.0, 0.0], [[1.0, 1.0]], r"W.generators: shape \(1, 2\) is not \(2, m\)"),
+        ([0.0, 0.0], [[1.0, 1.0]], r"Zonotope.generators: shape \(1, 2\) is not \(2, m\)"),
         ([0.0, np.nan], np.eye(2), "W.center: holds NaN"),
         ([0.0, 0.0], [[np.inf], [1]], "W.generators: holds NaN or infinity"),
         ([0.0], [[1.0]], "W: has dimension 1 where 2 is needed"),

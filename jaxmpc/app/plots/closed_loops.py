@@ -16,7 +16,6 @@ from jaxmpc.app.plots.style import (
     NOT_SOLVED,
     OUTER,
     SET_POINT,
-    TERMINAL,
     Style,
     patch,
 )
@@ -43,6 +42,7 @@ def plot_runs(
     reference: Any = None,
     input_reference: Any = None,
     robots: Sequence[int] | None = None,
+    title: str | None = None,
 ) -> Figure:
     """Draw closed loops over time: a panel for each position, velocity and input.
 
@@ -50,8 +50,10 @@ def plot_runs(
     outside is grey. Orange: the plan was solved and needs slack, hence exceeds soft limits
     somewhere on its horizon (fallback). Purple: the plan was not solved. Red: limits exceeded by
     more than 1e-6 (of the limit, if that is above 1). Cross: the next value is not finite.
-    reference (n,), input_reference (m,): set-points to draw. robots: which of the batch to draw, 24
-    at most by default; the title counts all. Raises ValueError for robots that are not there.
+    reference (n,), input_reference (m,): set-points to draw, or over time as `simulate` takes them.
+    robots: which of the batch to draw, 24 at most by default. title: None: counts of loops and
+    plans, of all of the batch. The figure has another size by its `set_size_inches`. Raises
+    ValueError for robots that are not there.
     """
     run = run.on_host()
     inputs, plans = np.asarray(run.inputs), plan_outcomes(run)
@@ -66,9 +68,9 @@ def plot_runs(
         values = (xi, inputs)[kind][shown, :, i]
         parts = [(colour, plans[name][shown].T) for name, (colour, _) in PLANS.items()]
         _draw_lines(ax, time, values.T, parts, broken.T)
-        draw_limits(ax, plant, kind, i, (reference, input_reference)[kind])
+        draw_limits(ax, plant, kind, i, (reference, input_reference)[kind], time)
     whole = kept[0].all(axis=(1, 2)) & kept[1].all(axis=(1, 2))
-    title = (
+    counts = (
         f"{plant.name}: {count:,} closed loop{'s' * (count > 1)} of {time[-1]:g} s, {len(shown):,} "
         f"shown. Limits kept by {np.count_nonzero(whole):,} of {count:,}\n{_plans_text(plans)}"
     )
@@ -85,7 +87,7 @@ def plot_runs(
     if not all(part[shown].all() for part in kept):
         handles.append(line("limit exceeded", color=BROKEN, marker="o", ms=3, ls=""))
     columns = max(1, min(len(handles), int(figure.get_figwidth() / 2.5)))
-    _title_and_legend(figure, title, handles, columns)
+    _title_and_legend(figure, counts if title is None else title, handles, columns)
     return figure
 
 
@@ -102,8 +104,8 @@ def plot_before_after(
     """Draw the same closed loops before and after tuning: a panel a position, velocity and input.
 
     before, after: of `simulate_many` from the same starts, of a Robot or LinearPlant, whose limits
-    are lines, grey outside. reference (n,), input_reference (m,): set-points to draw. loops: which
-    ones; None: 6 spread over all. Raises ValueError for loops that are not there.
+    are lines, grey outside. reference (n,), input_reference (m,): set-points to draw, or over time.
+    loops: which ones; None: 6 spread over all. Raises ValueError for loops that are not there.
     """
     before, after = before.on_host(), after.on_host()
     count, samples = np.shape(before.inputs)[:2]
@@ -123,7 +125,7 @@ def plot_before_after(
             style: dict[str, Any] = {"drawstyle": "steps-post"} if kind else {}
             ax.plot(time, lines, color=colour, lw=width, alpha=0.9, **style)
             _mark_ends(ax, time, lines, colour)
-        draw_limits(ax, plant, kind, i, (reference, input_reference)[kind])
+        draw_limits(ax, plant, kind, i, (reference, input_reference)[kind], time)
     handles: list[Any] = [
         Line2D([], [], color=BEFORE, lw=2.2, label="before"),
         Line2D([], [], color=AFTER, lw=1.0, label="after"),
@@ -186,20 +188,19 @@ def panel_grid(
     rows, (each, least, rest) = max(len(panels) for _, panels in columns), height
     size = (width * len(columns) + 0.2, max(each * rows, least) + rest)
     figure = Figure(figsize=size, layout="constrained")
-    grid = figure.subplots(rows, len(columns), sharex=True, squeeze=False)
     found = []
-    for column, (title, panels) in zip(grid.T, columns, strict=True):
-        for ax in column[len(panels) :]:
-            ax.set_axis_off()
+    # Each column fills the height, so that there is no gap below the shorter ones.
+    parts = figure.subfigures(1, len(columns), squeeze=False)[0]
+    for part, (title, panels) in zip(parts, columns, strict=True):
+        column = part.subplots(len(panels), sharex=True, squeeze=False)[:, 0]
         column[0].set_title(title, fontsize=9)
-        column[len(panels) - 1].set_xlabel("time [s]", fontsize=8)
-        column[len(panels) - 1].tick_params(labelbottom=True)
-        for ax, (kind, i, label) in zip(column, panels, strict=False):
+        column[-1].set_xlabel("time [s]", fontsize=8)
+        for ax, (kind, i, label) in zip(column, panels, strict=True):
             ax.set_ylabel(label, fontsize=8)
             ax.tick_params(labelsize=7)
             ax.set_xlim(0, time[-1])
             found.append((ax, kind, i))
-    figure.align_ylabels()
+        part.align_ylabels()
     return figure, found
 
 
@@ -263,8 +264,9 @@ def _mark_ends(ax: Axes, time: np.ndarray, values: np.ndarray, colour: str) -> N
     ax.plot(time[k], values[k, loop], "x", color=colour, ms=5, zorder=4)
 
 
-def draw_limits(ax: Axes, plant: Any, kind: int, i: int, reference: Any) -> None:
-    """Draw the limits of state (kind 0) or input (1) i, grey beyond them, and the set-point."""
+def draw_limits(ax: Axes, plant: Any, kind: int, i: int, reference: Any, time: np.ndarray) -> None:
+    """Draw the limits of state (kind 0) or input (1) i, grey beyond them, and the set-point, one or
+    one for each of the times (T + 1,) and later."""
     limits = plant.input_limits if kind else plant.state_limits
     ends = [float(np.asarray(end)[i]) for end in (limits.lower, limits.upper)]
     low, high = ax.get_ylim()
@@ -276,7 +278,10 @@ def draw_limits(ax: Axes, plant: Any, kind: int, i: int, reference: Any) -> None
         if np.isfinite(end):
             ax.axhspan(min(end, far), max(end, far), color=INFEASIBLE, lw=0, zorder=0)
             ax.axhline(end, color=EDGE, lw=0.7, zorder=1)
-    if reference is not None:
-        target = float(np.asarray(reference)[i])
-        ax.axhline(target, color=TERMINAL, lw=0.9, ls=(0, (4, 2)), zorder=3)
+    if np.ndim(reference) == 2:
+        targets = np.asarray(reference)[: len(time), i]
+        targets = np.append(targets, targets[-1:]) if len(targets) < len(time) else targets
+        ax.step(time[: len(targets)], targets, where="post", zorder=3, **SET_POINT)
+    elif reference is not None:
+        ax.axhline(float(np.asarray(reference)[i]), zorder=3, **SET_POINT)
     ax.set_ylim(low, high)

@@ -72,10 +72,11 @@ def plot_regions(
         values = regions.value(points) if show == "value" else regions.law(points)[:, output]
         image = ax.pcolormesh(*lines, values.reshape(GRID, GRID), cmap="viridis", shading="nearest")
         image.set_rasterized(True)
-        ax.figure.colorbar(image, ax=ax)
+        what = "Least cost" if show == "value" else name_of_output(regions, output)
+        bar = ax.figure.colorbar(image, ax=ax, label=f"{what[0].lower()}{what[1:]}", pad=0.02)
+        bar.outline.set_linewidth(0.6)
         polygons.set_facecolor("none")
         ax.add_collection(polygons)
-        what = "Least cost" if show == "value" else name_of_output(regions, output)
         title = f"{what} on {len(seen)} critical regions"
     ax.set(xlim=frame[0], ylim=frame[1])
     others = [i for i in range(p) if i not in axes]

@@ -8,6 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import PathPatch
+from matplotlib.path import Path
 from scipy.spatial import ConvexHull
 
 from jaxmpc.app.plots.style import (
@@ -41,9 +43,10 @@ def plot_feasible_set(
 
     Samples are coloured by label. The dashed line bounds the inner polytope (the convex hull of
     states with a checked plan), the solid one the outer polytope (the intersection of certified
-    half-spaces); the true boundary lies between them. Without `ax` a new figure is made; save it
-    with `ax.figure.savefig(path)`. picture: of a stored map, instead of the map's points. Raises
-    ValueError for a map not of two states.
+    half-spaces); the true boundary lies between them. Cells of a grid end at the bounds, for all
+    states within the inner one are feasible, and none beyond the outer one is. Without `ax` a new
+    figure is made; save it with `ax.figure.savefig(path)`. picture: of a stored map, instead of the
+    map's points. Raises ValueError for a map not of two states.
     """
     points, label, counts = np.asarray(fmap.x0s), np.asarray(fmap.label), None
     if picture is not None:
@@ -61,47 +64,74 @@ def plot_feasible_set(
         )
         if (count := counts[name] if counts else np.count_nonzero(label == value))
     ]
+    if ax.images:
+        ax.fill(*ring(fmap.inner).T, color=FEASIBLE, linewidth=0)
+        _paint_beyond(ax, ring(fmap.outer))
     handles += draw_bounds(ax, fmap)
     finish(ax, fmap.axis_names, _map_title(fmap), handles)
     return ax
+
+
+def _paint_beyond(ax: Axes, corners: np.ndarray) -> None:
+    """Paint what lies beyond a convex polygon (k, 2) as infeasible, to the ends of the axes."""
+    if not len(corners):
+        return
+    ends = np.array([*zip(ax.get_xlim(), ax.get_ylim(), strict=True), *corners])
+    (left, low), (right, high) = ends.min(axis=0), ends.max(axis=0)
+    frame = [(left, low), (right, low), (right, high), (left, high), (left, low)]
+    # A hole winds the other way round than what it is a hole of.
+    x, y = corners.T
+    clockwise = np.sum(x[:-1] * y[1:] - x[1:] * y[:-1]) < 0
+    hole = Path(corners if clockwise else corners[::-1], closed=True)
+    around = Path.make_compound_path(Path(frame, closed=True), hole)
+    ax.add_artist(PathPatch(around, facecolor=INFEASIBLE, linewidth=0))
 
 
 def plot_body(fmap: FeasibleSetMap) -> Figure:
     """Draw the feasible set of three states: its inner bound as a body in space, and inner and
     outer bound as they are projected onto each pair of states.
 
-    fmap: refined (`FeasibleSetMap.refine`), which proves the bounds. Where there is no inner bound
+    fmap: refined (`FeasibleSetMap.refine`), which brings the bounds together: blue is proved
+    feasible, yellow lies between the bounds. Where there is no inner bound
     the body is the outer one. Raises ValueError for a map not of three states, and where neither
     bound is a bounded body.
     """
-    names = fmap.axis_names
+    names, small = fmap.axis_names, for_column()
     if len(names) != 3:
         fail("fmap", f"maps {len(names)} states", "A body needs 3: choose `axes`")
     inner, outer = _corners(fmap.inner), _corners(fmap.outer)
     if not len(inner) and not len(outer):
         fail("fmap", "has no bounded body to draw", "Refine it, or map a set with an interior")
-    figure = Figure(figsize=(9.6, 8.0), layout="constrained")
-    space = figure.add_subplot(2, 2, 1, projection="3d")
+    figure = Figure(figsize=(COLUMN, 5.6) if small else (9.6, 8.0), layout="constrained")
+    grid = figure.add_gridspec(3 if small else 2, 2)
+    space = figure.add_subplot(grid[0, :] if small else grid[0, 0], projection="3d")
     body, colour = (fmap.inner(), INNER) if len(inner) else (fmap.outer(), OUTER)
     plot(body, ax=space, color=colour, alpha=0.35)
     for axis, name in zip("xyz", names, strict=True):
-        getattr(space, f"set_{axis}label")(name, fontsize=9)
-    space.set_title(_map_title(fmap), loc="left", fontsize=11)
+        getattr(space, f"set_{axis}label")(name, fontsize=7 if small else 9)
+    figure.suptitle(_map_title(fmap), x=0.01, ha="left", fontsize=8 if small else 11)
+    share = ""
+    if len(inner) and len(outer):
+        share = f" ({ConvexHull(inner).volume / ConvexHull(outer).volume:.1%} of it)"
     lines: list[tuple[np.ndarray, str, Style]] = [
         (outer, "outer bound", {"color": OUTER, "lw": 2.4}),
-        (inner, "inner bound", {"color": INNER, "lw": 1.4, "ls": (0, (3, 3))}),
+        (inner, f"inner bound{share}", {"color": INNER, "lw": 1.4, "ls": (0, (3, 3))}),
     ]
-    for place, (i, j) in zip((2, 3, 4), ((0, 1), (0, 2), (1, 2)), strict=True):
-        ax = figure.add_subplot(2, 2, place)
+    places = (grid[1, 0], grid[1, 1], grid[2, 0]) if small else (grid[0, 1], grid[1, 0], grid[1, 1])
+    for place, (i, j) in zip(places, ((0, 1), (0, 2), (1, 2)), strict=True):
+        ax = figure.add_subplot(place)
         for corners, _, style in lines:
             if len(corners):
                 shadow = corners[:, [i, j]]
                 around = shadow[ConvexHull(shadow).vertices]
+                ax.fill(*around.T, color=FEASIBLE if corners is inner else UNDECIDED, lw=0)
                 ax.plot(*np.vstack([around, around[:1]]).T, solid_joinstyle="round", **style)
         ax.set_xlabel(names[i])
         ax.set_ylabel(names[j])
-        ax.set_title("projection", loc="left", fontsize=9)
+        ax.set_title("projection", loc="left", fontsize=7 if small else 9)
         ax.grid(**GRID)
+    for ax in figure.axes:
+        ax.tick_params(labelsize=6 if small else 9)
     handles = [Line2D([], [], label=name, **style) for _, name, style in lines]
     figure.legend(handles=handles, loc="outside lower left", ncols=2, frameon=False)
     return figure
@@ -345,6 +375,10 @@ def draw_bounds(ax: Axes, fmap: FeasibleSetMap, of: str = "") -> list[Line2D]:
     return handles
 
 
+# Letters of a legend's words of which two columns fit into a column of a paper.
+SHORT = 26
+
+
 def finish(ax: Axes, names: Sequence[str], title: str, handles: list[Artist]) -> None:
     """Name the two axes, and set the title and, to the right of the axes, the legend; for a column
     below them."""
@@ -353,8 +387,12 @@ def finish(ax: Axes, names: Sequence[str], title: str, handles: list[Artist]) ->
     ax.set_title(title, loc="left", fontsize=8 if for_column() else 11)
     where: Style = {"loc": "upper left", "bbox_to_anchor": (1.02, 1.0)}
     if for_column():
-        where = {"loc": "upper left", "bbox_to_anchor": (-0.02, -0.18), "ncols": 2, "fontsize": 7}
-    ax.legend(handles=handles, frameon=False, handlelength=2.4, **where)
+        words = [line for handle in handles for line in str(handle.get_label()).split("\n")]
+        columns = 2 if max(map(len, words), default=0) < SHORT else 1
+        where = {"loc": "upper left", "bbox_to_anchor": (-0.02, -0.18), "fontsize": 7}
+        where |= {"ncols": columns}
+    if handles:
+        ax.legend(handles=handles, frameon=False, handlelength=2.4, **where)
 
 
 def draw_outcomes(
