@@ -366,7 +366,10 @@ class RowPrograms:
         k, d = rows.U.shape[1], rows.D.shape[1]
         both = np.hstack([rows.U, rows.D])
         ends = np.abs([rows.lower, rows.upper])
-        ends = np.where(np.isfinite(ends), ends, 0.0).max(axis=0)
+        ends = np.where(np.isfinite(ends), ends, 0.0)
+        near, far = ends.min(axis=0), ends.max(axis=0)
+        # An end a million times farther than the other stands for none.
+        ends = np.where((near > 0) & (far > 1e6 * near), near, far)
         # Margins in units in which rows and coordinates are about 1.
         size = np.where(self.equalities, 0.0, 1 / scaling(both, ends)[0])
         if rows.balls:

@@ -96,7 +96,8 @@ def outer_bound(claims: Claims) -> tuple[CenteredPolytope | None, np.ndarray]:
     half = np.column_stack([rays.normals[valid] / length[:, None], rays.offsets[valid] / length])
     # The same where they agree to 9 digits, in units of like size.
     like = half / (half[:, p:] - half[:, :p] @ rays.center[:, None])
-    like = like / np.abs(like).max(axis=0)
+    most = np.abs(like).max(axis=0)
+    like = like / np.where(most > 0, most, 1.0)
     half = half[np.unique(np.round(like, 9), axis=0, return_index=True)[1]]
     none = np.zeros((0, p))
     return CenteredPolytope(rays.center, half[:, :p], half[:, p], none), rays.points[found]

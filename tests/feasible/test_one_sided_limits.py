@@ -302,7 +302,7 @@ class TestOtherQuestions:
 def margin(mpc, pinned) -> float:
     """The largest distance that all rows can keep, by one LP in states and inputs.
 
-    pinned: values of coordinates of (x_0, u_{−1}). A free u_{−1} keeps the input limits.
+    pinned: values of coordinates of (x_0, u_{−1}). u_{−1} is one that the input limits allow.
     """
     n, m = np.shape(mpc.system.B)
     N, count = mpc.horizon, (mpc.horizon + 1) * n + (mpc.horizon + 1) * m + 1
@@ -322,7 +322,7 @@ def margin(mpc, pinned) -> float:
     if mpc.rate_limited:
         rate = problems.symmetric(*mpc.input_rate_limit)
         limits += [(rate, u[k + 1] - u[k]) for k in range(N)]
-        limits += [(mpc.inputs, u[0])] if max(pinned) < n else []
+        limits += [(mpc.inputs, u[0])]
     rows, bounds = [], []
     for box, value in limits:
         if box is not None:
