@@ -19,6 +19,7 @@ from jaxmpc.feasible.hull_labels import hull_for
 from jaxmpc.feasible.pipeline import Labels, OnDemand, Scope, labelled_parts
 from jaxmpc.feasible.policy_hull import policy_hull, policy_labels
 from jaxmpc.feasible.policy_problem import PolicyProblem, problem_of
+from jaxmpc.feasible.polytope_growth import any_policy_polytope
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.rays import closed_bounds
 from jaxmpc.mpc.problem import MPC
@@ -88,8 +89,32 @@ class FeasibleSetMap:
         }
         return (
             f"Feasible: {kinds[mpc.policy]} keeps all limits under every disturbance; infeasible: "
-            "no policy of this class does, others may (any_policy_polytope)."
+            "no policy of this class does, others may (any_policy_labels)."
         )
+
+    def any_policy_labels(self) -> np.ndarray:
+        """Return labels (B,) int8 of the same points about any policy, whose inputs may be any
+        function of the states so far: 1 where some policy keeps all limits under every disturbance,
+        −1 where none does, so that no other `policy` helps, 0 where a point lies within 1e-9 of
+        the boundary, or is not finite.
+
+        A point labelled feasible is. Others are compared with `any_policy_polytope`, which is
+        exact to rounding. Raises ValueError as that does, and for a projection.
+        """
+        view = self.problem.view
+        if view.projects:
+            fail("axes", "give a projection, of which there is no such set", "Give fixed too")
+        if self.mpc.disturbance is None:
+            return self.label.copy()
+        H, h = any_policy_polytope(self.mpc).half_spaces()
+        x = view.states(self.x0s)
+        with np.errstate(invalid="ignore", over="ignore"):
+            beyond = x @ H.T - h
+            near = 1e-9 * (np.abs(x) @ np.abs(H).T + np.abs(h))
+        inside, outside = np.all(beyond < -near, axis=1), np.any(beyond > near, axis=1)
+        inside |= self.label == 1
+        outside &= np.isfinite(x).all(axis=1) & ~inside
+        return np.where(inside, 1, np.where(outside, -1, 0)).astype(np.int8)
 
     @property
     def axes(self) -> tuple[int, ...]:

@@ -9,6 +9,7 @@ infeasible. The few points between get a ray of their own.
 """
 
 import functools
+import math
 import time
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -120,9 +121,9 @@ class PolicyRays:
         return self.problem.exact_rows.proves(theta, v, M)
 
     def parts(self, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return v (…, N m) and M (…, N m, N g) of flattened policies."""
-        shape = self.problem.causal.shape
-        return w[..., : shape[0]], w[..., shape[0] :].reshape(*w.shape[:-1], *shape)
+        """Return v (…, V) and M (…, N m, N g) of flattened policies."""
+        size, shape = self.problem.plan_size, self.problem.causal.shape
+        return w[..., :size], w[..., size:].reshape(*w.shape[:-1], *shape)
 
     def box(self) -> ProvedBounds:
         """Return the half-spaces of the bounding box, those that exist."""
@@ -231,12 +232,11 @@ class PolicyHull:
     def split(self, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return plans (K, N, m) and the rest (K, …) of flattened policies (K, v)."""
         problem = self.rays.problem
-        N, m = problem.mpc.horizon, problem.mpc.system.m
-        shape = problem.answer_shape
-        return w[:, : N * m].reshape(len(w), N, m), w[:, N * m :].reshape(len(w), *shape)
+        plans, shape = problem.inputs(w), problem.answer_shape
+        return plans, w[:, w.shape[1] - math.prod(shape) :].reshape(len(w), *shape)
 
     def policies(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return v (B, N m) and M (B, N m, N g) of feasible points (B, d), for ω as in
+        """Return v (B, V) and M (B, N m, N g) of feasible points (B, d), for ω as in
         `policy_problem.py`: combined, or by a ray where no cone holds the point. NaN where there is
         none."""
         with jax.enable_x64(True):
@@ -332,7 +332,7 @@ def affine_policies(mpc: MPC | PolicyProblem, x0s: Reals) -> AffinePolicies:
     center, gamma = (np.asarray(part, float) for part in directions(problem.mpc))
     (B, _), N, m, p = v.shape, problem.mpc.horizon, problem.mpc.system.m, len(center)
     answers = M.reshape(B, N, m, N, gamma.shape[1]) @ np.linalg.pinv(gamma)
-    plan = v.reshape(B, N, m) - np.einsum("bimjp,p->bim", answers, center)
+    plan = problem.inputs(v) - np.einsum("bimjp,p->bim", answers, center)
     return AffinePolicies(plan, answers.reshape(B, N, m, N, p))
 
 

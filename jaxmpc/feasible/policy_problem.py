@@ -34,10 +34,10 @@ import numpy as np
 
 from jaxmpc.arrays import Reals
 from jaxmpc.checks import fail, require_kind
-from jaxmpc.feasible.hard_constraints import Axes, hard_blocks, make_view
+from jaxmpc.feasible.hard_constraints import Axes, augmented_dynamics, hard_blocks, make_view
 from jaxmpc.feasible.plan_polytope import PlanPolytope
 from jaxmpc.feasible.problem import FeasibilityProblem, as_box
-from jaxmpc.mpc.policy_rows import require_generators, require_plain_rows, tube_section
+from jaxmpc.mpc.policy_rows import require_free_inputs, require_generators, tube_section
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.tightening import feedback_gain, without_disturbance
 from jaxmpc.pytrees import record
@@ -60,18 +60,21 @@ def problem_of(mpc: MPC, axes: Axes = None, fixed: Reals | None = None) -> Feasi
 
 
 class PolicyRows(NamedTuple):
-    """lower ≤ F θ + G v + (D + G M) ω ≤ upper in exact fractions (arrays of objects): F (R, d), G
-    (R, N m), D (R, N g), lower and upper (R,), None where there is no bound. low, high (N m,):
-    bounds of each v. first: (m, N m) and (m,), the first input from v. Of a tube v is (v, ζ), and
-    there is no ω."""
+    """lower ≤ F θ + G v + (D + J M) ω ≤ upper in exact fractions (arrays of objects): F (R, d), G
+    (R, V), J (R, N m), D (R, N g), lower and upper (R,), None where there is no bound. low, high
+    (V,): bounds of each v. half (N m,): half the widths of the limits of each input. first: (m, V)
+    and (m,), the first input from v. G is J but where a control horizon holds v. Of a tube v is
+    (v, ζ), and there is neither ω nor J."""
 
     F: np.ndarray
     G: np.ndarray
+    J: np.ndarray
     D: np.ndarray
     lower: list[Fraction | None]
     upper: list[Fraction | None]
     low: np.ndarray
     high: np.ndarray
+    half: np.ndarray
     first: tuple[np.ndarray, np.ndarray]
 
 
@@ -85,13 +88,13 @@ class PolicyProblem(FeasibilityProblem):
         """Return the feasibility problem of `mpc`; axes, fixed: a slice, as in `map_feasible_set`.
 
         Raises ValueError for an ill-posed problem, for a projection, and for what affine policies
-        are not computed with: control horizons, rate limits, inputs without a bounded box.
+        are not computed with: control horizons of tubes, inputs without a bounded box.
         """
         require_kind("mpc", mpc, MPC)
         mpc.validate()
         boxes = {name: as_box(getattr(mpc, name)) for name in ("states", "inputs", "terminal_set")}
         hard = replace(mpc, soft=(), input_rate_weight=None, **boxes)
-        require_plain_rows(hard)
+        require_free_inputs(hard)
         inputs = hard.inputs
         if not isinstance(inputs, Box) or not np.isfinite(inputs.bounds()).all():
             fail("inputs", "are in no bounded Box, which proofs of this policy need", "Give one")
@@ -100,6 +103,8 @@ class PolicyProblem(FeasibilityProblem):
             fail("axes", "give a projection, which this policy does not know", "Give fixed too")
         if hard.policy == "affine":
             directions(hard)
+        elif hard.rate_limited:
+            require_generators(hard.disturbance)
         return cls(hard, view)
 
     @cached_property
@@ -115,10 +120,10 @@ class PolicyProblem(FeasibilityProblem):
 
     @cached_property
     def causal(self) -> np.ndarray:
-        """Return which entries (N m, N g) of M answer to earlier disturbances."""
+        """Return which entries (N m, N g) of M answer to earlier disturbances; none of a tube."""
         N, m = self.mpc.horizon, self.mpc.system.m
         if self.mpc.policy == "tube":
-            return np.zeros((self.fractions.G.shape[1], 0), bool)
+            return np.zeros((0, 0), bool)
         g = directions(self.mpc)[1].shape[1]
         return np.kron(np.tril(np.ones((N, N)), -1), np.ones((m, g))) > 0
 
@@ -131,8 +136,8 @@ class PolicyProblem(FeasibilityProblem):
     def plan_polytope(self) -> PlanPolytope:
         """Return the polytope of all states and affine policies, all states for any view."""
         whole = replace(self, view=make_view(self.mpc)) if self.view.others else self
-        lifted, n = whole.lifted, self.mpc.system.n
-        A, B, c = host_matrices(self.mpc.system)
+        lifted, n = whole.lifted, self.mpc.dimension
+        A, B, c = augmented_dynamics(self.mpc)
         gain, shift = whole.fractions.first
         M = np.zeros((n, lifted.rows.shape[1]))
         M[:, :n], M[:, n : n + gain.shape[1]] = A, B @ gain
@@ -150,8 +155,20 @@ class PolicyProblem(FeasibilityProblem):
         """Return the shape of what a policy has beside its plan v: (N, m, N, g) of the M of ω, (g,)
         of the ζ of a tube."""
         N, m = self.mpc.horizon, self.mpc.system.m
-        rows, width = self.causal.shape
-        return (rows - N * m,) if self.mpc.policy == "tube" else (N, m, N, width // N)
+        if self.mpc.policy == "tube":
+            return (self.plan_size - N * m,)
+        return N, m, N, self.causal.shape[1] // N
+
+    @property
+    def plan_size(self) -> int:
+        """Return the number of v, with the ζ of a tube."""
+        return self.fractions.G.shape[1]
+
+    def inputs(self, v: np.ndarray) -> np.ndarray:
+        """Return the inputs (…, N, m) that v (…, V) stands for."""
+        m, moves = self.mpc.system.m, np.array(self.mpc.moves)
+        free = v[..., : (moves.max() + 1) * m]
+        return free.reshape(*v.shape[:-1], -1, m)[..., moves, :]
 
     def _refuse(self) -> NoReturn:
         cure = 'Give policy="tightened"; maps, sweeps, boundary and feasible_polytope take it'
@@ -170,19 +187,24 @@ class PolicyProblem(FeasibilityProblem):
 
 
 def directions(mpc: MPC) -> tuple[np.ndarray, np.ndarray]:
-    """Return center (p,) and Γ (p, g) of w = center + Γ ω, |ω_i| ≤ 1, in fractions; the columns are
-    independent. Raises ValueError for sets without such a form."""
-    W: Any = mpc.disturbance
+    """Return `generators` of the disturbances, which are independent. Raises ValueError for sets
+    without such a form."""
+    require_generators(mpc.disturbance)
+    center, gamma = generators(mpc.disturbance)
+    if np.linalg.matrix_rank(np.asarray(gamma, float)) < gamma.shape[1]:
+        what = "has generators that depend on each other, to which no policy can answer one by one"
+        fail("disturbance", what, 'Give a Box or independent generators, or policy="tightened"')
+    return center, gamma
+
+
+def generators(W: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return center (p,) and Γ (p, g) of w = center + Γ ω, |ω_i| ≤ 1, in fractions, of a Box or a
+    Zonotope."""
     if isinstance(W, Box):
         lower, upper = exactly(W.lower), exactly(W.upper)
         half = (upper - lower) / 2
         return (lower + upper) / 2, np.diag(half)[:, half > 0]
-    require_generators(W)
-    center, G = np.asarray(W.center, float), np.asarray(W.generators, float)
-    if np.linalg.matrix_rank(G) < G.shape[1]:
-        what = "has generators that depend on each other, to which no policy can answer one by one"
-        fail("disturbance", what, 'Give a Box or independent generators, or policy="tightened"')
-    return exactly(center), exactly(G)
+    return exactly(W.center), exactly(W.generators)
 
 
 def exactly(values: Any) -> np.ndarray:
@@ -192,35 +214,45 @@ def exactly(values: Any) -> np.ndarray:
 
 def affine_fractions(mpc: MPC, view: Any) -> PolicyRows:
     """Return the rows under affine policies, over θ, v and ω, all products of the data exact."""
-    n = mpc.system.n
+    n, m, moves = mpc.system.n, mpc.system.m, mpc.moves
     center, gamma = directions(mpc)
     E = exactly(disturbance_columns(mpc.disturbance_matrix, n))
-    return condensed_fractions(mpc, view, E @ center, E @ gamma)
+    p = condensed_fractions(mpc, view, E @ center, E @ gamma)
+    if mpc.control_horizon is None:
+        return p
+    places = np.kron(np.eye(max(moves) + 1, dtype=int)[list(moves)], np.eye(m, dtype=int))
+    begins = np.argmax(places, axis=0)
+    first = p.first[0][:, begins], p.first[1]
+    return p._replace(G=p.G @ places, low=p.low[begins], high=p.high[begins], first=first)
 
 
 def tube_fractions(mpc: MPC, view: Any) -> PolicyRows:
-    """Return the rows of a tube, over θ and (v, ζ), all products of the data exact."""
+    """Return the rows of a tube, over θ and (v, ζ), all products of the data exact.
+
+    With u_{−1} − K (x_0 − z_0) for the previous input of the nominal trajectory its first rate is
+    that of the input that is applied."""
     n, m, N = mpc.system.n, mpc.system.m, mpc.horizon
     gain, section = np.asarray(feedback_gain(mpc), float), tube_section(mpc)
-    center, generators = exactly(section.center), exactly(section.generators)
-    count = generators.shape[1]
+    center, sides = exactly(section.center), exactly(section.generators)
+    count, K = sides.shape[1], exactly(gain)
     nominal = condensed_fractions(mpc, view, 0 * center, zeros(n, 0))
     # z_0 = θ − center − G ζ: what an initial state adds to each row, without the view.
     whole = condensed_fractions(mpc, make_view(mpc), 0 * center, zeros(n, 0)).F
-    G = np.hstack([nominal.G, -(whole @ generators)])
-    shift, K = whole @ center, exactly(gain)
+    found = [(b, k) for b in hard_blocks(without_disturbance(mpc)) for k in b.steps]
+    held = np.repeat([b.kind == "previous input" for b, _ in found], [b.size for b, _ in found])
+    whole = np.where(held[:, None], Fraction(0), whole)  # u_{−1} itself is limited
+    if mpc.rate_limited:
+        whole = whole[:, :n] + whole[:, n:] @ K
+    G = np.hstack([nominal.G, -(whole @ sides)])
+    shift = whole @ center
     lower: list[Fraction | None] = []
     upper: list[Fraction | None] = []
-    rows = [
-        row
-        for b in hard_blocks(without_disturbance(mpc))
-        for k in b.steps
-        for row in exactly(b.H) + (exactly(b.D) @ K if k < N else 0)
-    ]
-    for row, low, high, moved in zip(rows, nominal.lower, nominal.upper, shift, strict=True):
-        middle, half = row @ center, sum(abs(row @ generators))
-        lower.append(None if low is None else low + moved - middle + half)
-        upper.append(None if high is None else high + moved - middle - half)
+    taken = [pair for b, k in found for pair in _taken_of_tube(mpc, b, k, K, center, sides)]
+    for (down, up), low, high, moved in zip(
+        taken, nominal.lower, nominal.upper, shift, strict=True
+    ):
+        lower.append(None if low is None else low + moved + down)
+        upper.append(None if high is None else high + moved - up)
     one = [Fraction(1)] * count
     ones = np.array(one, object)
     limits = np.hstack([zeros(count, N * m), np.diag(ones)]) if count else G[:0]
@@ -228,13 +260,35 @@ def tube_fractions(mpc: MPC, view: Any) -> PolicyRows:
     return PolicyRows(
         F=np.vstack([nominal.F, zeros(count, nominal.F.shape[1])]),
         G=np.vstack([G, limits + zeros(count, G.shape[1])]),
+        J=zeros(len(G) + count, 0),
         D=zeros(len(G) + count, 0),
         lower=[*lower, *(-v for v in one)],
         upper=[*upper, *one],
         low=np.append(nominal.low, -ones),
         high=np.append(nominal.high, ones),
+        half=zeros(0),
         first=(first, gain @ np.asarray(section.center, float)),
     )
+
+
+def _taken_of_tube(
+    mpc: MPC, b: Any, k: int, K: np.ndarray, center: np.ndarray, G: np.ndarray
+) -> list[tuple[Fraction, Fraction]]:
+    """Return what a tube takes from the lower and the upper bound of each row of a block at k."""
+    n, N = mpc.system.n, mpc.horizon
+    if b.kind == "previous input" or (b.rate and k == 0):
+        return [(Fraction(0), Fraction(0))] * b.size
+    along = exactly(b.H)[:, :n] + (exactly(b.D) @ K if k < N else 0)
+    middle, half = zeros(b.size), zeros(b.size)
+    if b.rate:
+        A, B, _ = map(exactly, host_matrices(mpc.system))
+        mid, gamma = generators(mpc.disturbance)
+        push = along @ exactly(disturbance_columns(mpc.disturbance_matrix, n))
+        middle, half = push @ mid, abs(push @ gamma).sum(axis=1)
+        along = along @ (A + B @ K) - along
+    middle = middle + along @ center
+    half = half + abs(along @ G).sum(axis=1)
+    return [(h - c, h + c) for c, h in zip(middle, half, strict=True)]
 
 
 def zeros(*shape: int) -> np.ndarray:
@@ -244,10 +298,13 @@ def zeros(*shape: int) -> np.ndarray:
 
 def condensed_fractions(mpc: MPC, view: Any, drift: np.ndarray, push: np.ndarray) -> PolicyRows:
     """Return the rows of x⁺ = A x + B u + c + drift + push ω without any rounding, their bounds as
-    given."""
-    N, n, m, g = mpc.horizon, mpc.system.n, mpc.system.m, push.shape[1]
-    A, B, c = map(exactly, host_matrices(mpc.system))
-    c = c + drift
+    given; x stands for (x, u_{−1}) where rates are limited."""
+    N, m, g = mpc.horizon, mpc.system.m, push.shape[1]
+    n = mpc.dimension
+    A, B, c = map(exactly, augmented_dynamics(mpc))
+    more = n - len(drift)
+    c = c + np.append(drift, zeros(more))
+    push = np.vstack([push, zeros(more, g)])
     S, base = zeros(n, len(view.axes)), zeros(n)
     for i, axis in enumerate(view.axes):
         S[axis, i] = Fraction(1)
@@ -282,7 +339,8 @@ def condensed_fractions(mpc: MPC, view: Any, drift: np.ndarray, push: np.ndarray
     ends = [np.tile(exactly(end), N) for end in (box.lower, box.upper)]
     first = np.eye(m, N * m), np.zeros(m)
     D = D.reshape(len(lower), N * g)
-    return PolicyRows(F, G, D, lower, upper, ends[0], ends[1], first)
+    least, most = ends
+    return PolicyRows(F, G, G, D, lower, upper, least, most, (most - least) / 2, first)
 
 
 class Lifted(NamedTuple):
@@ -302,19 +360,19 @@ class Lifted(NamedTuple):
     @classmethod
     def of(cls, p: PolicyRows, causal: np.ndarray) -> "Lifted":
         """Return the rows in floats."""
-        F, G, D = (np.asarray(v, float) for v in (p.F, p.G, p.D))
+        F, G, J, D = (np.asarray(v, float) for v in (p.F, p.G, p.J, p.D))
         R, d, nv, places = len(F), F.shape[1], G.shape[1], np.argwhere(causal)
         at = np.full(causal.shape, -1)
         at[tuple(places.T)] = np.arange(len(places))
         # Entries of a row's answer to ω that are there, or that a policy can make.
-        reached = (G != 0).astype(int) @ causal.astype(int) > 0
+        reached = (J != 0).astype(int) @ causal.astype(int) > 0
         entry = np.argwhere((D != 0) | reached)
         first = d + nv + len(places)
         total = first + len(entry)
         answers = np.zeros((len(entry), total))
         for t, (i, q) in enumerate(entry):
-            a = np.flatnonzero((G[i] != 0) & causal[:, q])
-            answers[t, d + nv + at[a, q]] = G[i, a]
+            a = np.flatnonzero((J[i] != 0) & causal[:, q])
+            answers[t, d + nv + at[a, q]] = J[i, a]
         own = np.zeros((len(entry), total))
         own[:, first:] = np.eye(len(entry))
         ends = np.zeros((R, total))
@@ -336,7 +394,7 @@ class Lifted(NamedTuple):
         return cls(np.vstack(rows), np.concatenate(bounds), above, below, entry, plus, minus, sizes)
 
     def policy(self, x: np.ndarray, causal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return v (N m,) and M (N m, N g) of a point x."""
+        """Return v (V,) and M (N m, N g) of a point x."""
         d, nv, count = self.sizes
         M = np.zeros(causal.shape)
         M[causal] = x[d + nv : d + nv + count]
@@ -436,13 +494,13 @@ class ExactRows:
 
     def __init__(self, p: PolicyRows) -> None:
         bounds = [v for v in (*p.lower, *p.upper) if v is not None]
-        every = [*p.F.ravel(), *p.G.ravel(), *p.D.ravel(), *bounds]
+        every = [*p.F.ravel(), *p.G.ravel(), *p.J.ravel(), *p.D.ravel(), *bounds]
         self.e = max((v.denominator.bit_length() - 1 for v in every), default=0)
         whole = lambda v: np.asarray(np.frompyfunc(lambda f: int(f * 2**self.e), 1, 1)(v), object)
-        self.F, self.G, self.D = whole(p.F), whole(p.G), whole(p.D)
+        self.F, self.G, self.J, self.D = whole(p.F), whole(p.G), whole(p.J), whole(p.D)
         self.lower = [None if v is None else int(v * 2**self.e) for v in p.lower]
         self.upper = [None if v is None else int(v * 2**self.e) for v in p.upper]
-        self.v_lower, self.v_upper = p.low, p.high
+        self.v_lower, self.v_upper, self.half = p.low, p.high, p.half
 
     def proves(self, theta: np.ndarray, v: np.ndarray, M: np.ndarray) -> bool:
         """Return whether a triple of floats keeps all rows."""
@@ -450,7 +508,7 @@ class ExactRows:
         top = max(at.e, plan.e, answer.e)  # all over 2^(e + top)
         value = (self.F @ at.values) * (1 << top - at.e)
         value = value + (self.G @ plan.values) * (1 << top - plan.e)
-        moved = self.D * (1 << top) + (self.G @ answer.values) * (1 << top - answer.e)
+        moved = self.D * (1 << top) + (self.J @ answer.values) * (1 << top - answer.e)
         reach = np.abs(moved).sum(axis=1)
         for i, (low, high) in enumerate(zip(self.lower, self.upper, strict=True)):
             if high is not None and value[i] + reach[i] > high << top:
@@ -485,12 +543,10 @@ class ExactRows:
         slope = y @ self.G  # of v, at least its least over the box
         for g, low, high in zip(slope, self.v_lower, self.v_upper, strict=True):
             b -= min(int(g) * low, int(g) * high)
-        left = np.abs(self.G.T @ q) * causal
+        left = np.abs(self.J.T @ q) * causal
         # Σ |entries of a row of M| ≤ half the width of that input's limits.
-        for worst, low, high in zip(
-            left.max(axis=1, initial=0), self.v_lower, self.v_upper, strict=True
-        ):
-            b += int(worst) * (high - low) / 2
+        for worst, half in zip(left.max(axis=1, initial=0), self.half, strict=True):
+            b += int(worst) * half
         a, scale = y @ self.F, Fraction(1, 2 ** (self.e + BITS))
         normal = np.array([float(Fraction(int(v)) * scale) for v in a])
         off = np.array(

@@ -10,11 +10,13 @@ import numpy as np
 from jaxmpc.checks import fail, require_kind
 from jaxmpc.feasible.plan_polytope import DIMENSIONS, FACETS, CenteredPolytope, projected
 from jaxmpc.feasible.policy_problem import problem_of
+from jaxmpc.mpc.plan import rate_ends
 from jaxmpc.mpc.problem import HARD, MPC
 from jaxmpc.pytrees import record
 from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope
 from jaxmpc.sets.geometry import unit_rows
 from jaxmpc.sets.predecessors import predecessor
+from jaxmpc.systems.system import LinearSystem, host_matrices
 
 # Why the facets of problems of many states with limited rates are not found, and what helps.
 RATES = (
@@ -60,24 +62,64 @@ def any_policy_polytope(mpc: MPC) -> Polytope:
 
     By dynamic programming, N steps of `predecessor` from the terminal set (without one, from the
     state limits): exact to rounding, whatever the policy of `mpc` is, whose sets lie inside it. A
-    state outside is infeasible for every policy. Works as far as elimination goes. Raises
-    ValueError for other limits than those of states and inputs at the usual steps, an ellipsoidal
-    terminal set, and as `predecessor` does.
+    state outside is infeasible for every policy. Where input rates are limited states are
+    (x, u_{−1}). Soft rows count as none, as in labels, and inputs are free at each step, also where
+    `control_horizon` holds them. Works as far as elimination goes. Raises ValueError for other
+    limits than those of states, inputs and their rates at the usual steps, an ellipsoidal terminal
+    set, and as `predecessor` does.
     """
     require_kind("mpc", mpc, MPC)
     mpc.validate()
     mpc.require_constant("steps back from the terminal set are all the same", *HARD)
-    if not is_standard_form(mpc) or not mpc.constrain_initial or mpc.states is None or mpc.soft:
-        what = "has other limits than those of states and inputs at the usual steps"
+    plain = replace(mpc, soft=(), control_horizon=None, input_rate_limit=None)
+    if not is_standard_form(plain) or not mpc.constrain_initial or mpc.states is None:
+        what = "has other limits than those of states, inputs and their rates at the usual steps"
         fail("mpc", what, "Give it without them")
     if isinstance(mpc.terminal_set, Ellipsoid):
         fail("terminal_set", "is an Ellipsoid, which has no facets", "Give a Polytope")
+    if mpc.rate_limited:
+        return _any_policy_of_rates(mpc)
     last: Any = mpc.terminal_set
     body, count = (mpc.states, mpc.horizon - 1) if last is None else (last, mpc.horizon)
     sides = mpc.states, mpc.inputs, mpc.disturbance, mpc.disturbance_matrix
     for _ in range(count):
         body = predecessor(mpc.system, body, *sides)
     return body if isinstance(body, Polytope) else body.to_polytope()
+
+
+def _any_policy_of_rates(mpc: MPC) -> Polytope:
+    """Return the same for states (x, u_{−1}), whose input is the change Δ of u: x⁺ = A x + B u_{−1}
+    + B Δ + c + E w, and u_{−1} + Δ is the next u_{−1}."""
+    n, m = mpc.system.n, mpc.system.m
+    A, B, c = host_matrices(mpc.system)
+    system = LinearSystem(
+        np.block([[A, B], [np.zeros((m, n)), np.eye(m)]]),
+        np.vstack([B, np.eye(m)]),
+        c=np.append(c, np.zeros(m)),
+    )
+    of_x, of_u = np.eye(n, n + m), np.eye(m, n + m, n)
+
+    def lifted(body: Any, M: np.ndarray) -> Polytope:
+        if body is None:
+            return Polytope(np.zeros((0, n + m)), np.zeros(0))
+        return body.to_polytope().preimage(M)
+
+    limits = lifted(mpc.inputs, of_u)
+    states = lifted(mpc.states, of_x).intersect(limits)
+    # Without limits of x_N and u_{N−1} no change of the last step is too large.
+    body = lifted(mpc.terminal_set, of_x).intersect(limits)
+    free = not len(np.asarray(body.h))
+    E = None
+    if mpc.disturbance is not None:
+        given = np.eye(n) if mpc.disturbance_matrix is None else mpc.disturbance_matrix
+        E = of_x.T @ np.asarray(given, float)
+    changes = Box(*(np.broadcast_to(np.asarray(v, float), (m,)) for v in rate_ends(mpc)))
+    for k in range(mpc.horizon):
+        if k == 0 and free:
+            body = states
+        else:
+            body = predecessor(system, body, states, changes, mpc.disturbance, E)
+    return body
 
 
 @record

@@ -360,8 +360,9 @@ def planned(
         more = c.response(mpc.system, aim.forecast)
         states, inputs = states + more[0], inputs + more[1]
     if isinstance(c, PolicyCondensed):
-        feedback, found = c.feedback(found.z), replace(found, y=c.of_plan(found.y))
-        return answer(mpc, c.layout, found, fault, states, inputs, aim, feedback)
+        feedback, beyond = c.feedback(found.z), c.beyond(_qp(controller, theta, aim), found.z)
+        found = replace(found, y=c.of_plan(found.y))
+        return answer(mpc, c.layout, found, fault, states, inputs, aim, feedback, beyond)
     terms = stated_terms(*jax.lax.stop_gradient((controller, found.y, states, inputs, aim)))
     eps, dtype = jnp.asarray(controller.solver.eps, states.dtype), states.dtype
     if dtype == jnp.float64:

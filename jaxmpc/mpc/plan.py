@@ -268,16 +268,23 @@ def answer(
     u: Array,
     aim: Aim,
     feedback: Array | None = None,
+    beyond: Array | None = None,
 ) -> Plan:
     """Return the plan of a QP's solution, states x (N+1, n), inputs u (N, m) and the feedback of
-    affine policies: NaN and the status `fault` where the data had one."""
-    solution = with_fault(replace(found, cost=cost(mpc, x, u, aim)), fault)
+    affine policies: NaN and the status `fault` where the data had one. beyond (copies, rows): by
+    how much policies may violate each row, on each of these sides; None: as x and u do."""
+    if beyond is None:
+        worst = paid = _violations(mpc, x, u)
+    else:
+        paid = [pair for side in beyond for pair in _of_soft_blocks(mpc, layout, side)]
+        worst = _of_soft_blocks(mpc, layout, jnp.max(beyond, axis=0))
+    solution = with_fault(replace(found, cost=cost(mpc, x, u, aim, paid)), fault)
     nan = lambda v: jnp.where(fault == Status.NOT_RUN, v, jnp.nan)
     return Plan(
         states=nan(x),
         inputs=nan(u),
         cost=solution.cost,
-        slack=nan(slack(mpc, x, u)),
+        slack=nan(_slack(worst, x)),
         multipliers=sorted_multipliers(mpc, layout, solution.y),
         status=solution.status,
         primal_residual=solution.primal_residual,
@@ -339,9 +346,16 @@ def applied(
     return Control(u, plan, memory)
 
 
-def cost(mpc: MPC, states: Array, inputs: Array, aim: Aim) -> Array:
+def cost(
+    mpc: MPC,
+    states: Array,
+    inputs: Array,
+    aim: Aim,
+    violations: list[tuple[Block, Array]] | None = None,
+) -> Array:
     """Return J (without ½) of a trajectory, states (N+1, n) and inputs (N, m), with what input
-    rates and soft rows add."""
+    rates and soft rows add. violations: of soft blocks, None: those of the trajectory."""
+    violations = _violations(mpc, states, inputs) if violations is None else violations
     error = states if aim.states is None else states - aim.states
     effort = inputs if aim.inputs is None else inputs - aim.inputs
     square = lambda v, W: jnp.sum(v * apply(W, v))
@@ -353,7 +367,7 @@ def cost(mpc: MPC, states: Array, inputs: Array, aim: Aim) -> Array:
         last = aim.previous_input
         first = jnp.zeros_like(inputs[0]) if last is None else last
         J = J + square(jnp.diff(inputs, axis=0, prepend=first[None]), weights.W)
-    for block, e in _violations(mpc, states, inputs):
+    for block, e in violations:
         J = J + jnp.sum(e * (block.linear + 0.5 * block.quadratic * e))
     return J
 
@@ -361,9 +375,13 @@ def cost(mpc: MPC, states: Array, inputs: Array, aim: Aim) -> Array:
 def slack(mpc: MPC, states: Array, inputs: Array) -> Array:
     """Return the violation of the p soft rows along a trajectory: (N+1, p), zero at stages where
     a row does not hold."""
+    return _slack(_violations(mpc, states, inputs), states)
+
+
+def _slack(violations: list[tuple[Block, Array]], states: Array) -> Array:
     columns = [
         jnp.zeros((len(states), block.size), e.dtype).at[np.array(block.steps, int)].set(e)
-        for block, e in _violations(mpc, states, inputs)
+        for block, e in violations
     ]
     return jnp.concatenate([jnp.zeros((len(states), 0), states.dtype), *columns], axis=1)
 
@@ -379,6 +397,12 @@ def _violations(mpc: MPC, states: Array, inputs: Array) -> list[tuple[Block, Arr
             beyond = jnp.maximum(value - block.upper, block.lower - value)
             found.append((block, jnp.maximum(beyond, 0.0)))
     return found
+
+
+def _of_soft_blocks(mpc: MPC, layout: Layout, beyond: Array) -> list[tuple[Block, Array]]:
+    """Return each soft block with its part (steps, rows) of the violations of all rows."""
+    parts = zip(given_blocks(mpc, beyond.dtype), split(layout, beyond), strict=True)
+    return [(block, e) for block, e in parts if block.linear is not None]
 
 
 def sorted_multipliers(mpc: MPC, layout: Layout, y: Array) -> Multipliers:

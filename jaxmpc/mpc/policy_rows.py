@@ -11,13 +11,17 @@ keeps its limits for all of them if and only if with T ≥ |(D + G M) Γ|, entry
     F θ + G v + (D + G M) center + Σ T ≤ upper,    F θ + G v + (D + G M) center − Σ T ≥ lower.
 
 The QP has the variables (v, M, T); its rows are those of the upper bounds, those of the lower ones
-and then −T ≤ (D + G M) Γ ≤ T. Entries that no policy moves need no T.
+and then −T ≤ (D + G M) Γ ≤ T. Entries that no policy moves need no T. Rows of rates hold the
+differences of the M of two steps. A control horizon holds v, not M: G is then one matrix for v and
+another for M. Soft rows may be violated on each side, by the worst w.
 
 *Tubes* (Mayne, Seron & Raković 2005, Automatica 41): u = v + K (x − z) with a nominal trajectory z
 that begins anywhere in x_0 − S, S = center + {G ζ : |ζ_i| ≤ 1} a robust invariant set under K. The
 rows of (z, v) are tightened by S. Without disturbances x_k = z_k + A_K^k (x_0 − z_0), so that the
 rows of the plan lose what x_0 − z_0 does to them under u = K x: linear in ζ. The variables of the
-QP are those of the plan and ζ, its rows those of the plan and |ζ_i| ≤ 1.
+QP are those of the plan and ζ, its rows those of the plan and |ζ_i| ≤ 1. Of the rates the first,
+u_0 − u_{−1}, is known and not tightened; the others lose what K (e_k − e_{k−1}) can be, with
+e_k = A_K e_{k−1} + E w, e_{k−1} in S and w in W.
 """
 
 from collections.abc import Sequence
@@ -41,6 +45,7 @@ from jaxmpc.qp.jax_transformations import compiled_lightly, own_modes
 from jaxmpc.qp.linalg import arrays, matmul
 from jaxmpc.qp.problem import QP
 from jaxmpc.sets.convex_sets import Box, Zonotope
+from jaxmpc.sets.disturbances import with_vertices, worst
 from jaxmpc.sets.minimal_invariant import minimal_robust_invariant_set
 
 # What stands for no bound of a variable.
@@ -54,12 +59,14 @@ class PolicyCondensed(Condensed):
     """The condensed QP with the variables of a policy behind those of the plan.
 
     `layout` is that of the plan's rows; these stand `copies` times at the beginning of C.
-    response_to_disturbances: (N, m, N p), what inputs do about disturbances before any M; None for
-    tubes. extent: (nz,) and (nz, p), by which and by how much for each |θ_i| the entries of a
-    feasible z are bounded; None where inputs have no Box.
+    response_to_disturbances: (N, m, N p), what inputs do about disturbances before any M, and
+    of_answers: (N, m, N m), what they do about M; None for tubes. extent: (nz,) and (nz, p), by
+    which and by how much for each |θ_i| the entries of a feasible z are bounded; None where inputs
+    have no Box.
     """
 
     response_to_disturbances: Any
+    of_answers: Any
     extent: Any
     copies: int = static()
 
@@ -87,6 +94,14 @@ class PolicyCondensed(Condensed):
         count = row_count(self.layout)
         return jnp.sum(y[: self.copies * count].reshape(self.copies, count), axis=0)
 
+    def beyond(self, qp: QP, z: Array) -> Array:
+        """Return by how much a solution may violate each of the plan's rows (copies, rows): under
+        affine policies its upper and its lower bound, of a tube either."""
+        value = matmul(qp.A, z)
+        over = jnp.maximum(jnp.maximum(value - qp.u, qp.l - value), 0.0)
+        count = row_count(self.layout)
+        return over[: self.copies * count].reshape(self.copies, count)
+
     def of_all(self, shift: Array) -> Array:
         """Return what is added to all rows where `shift` is added to the plan's."""
         along = jnp.tile(shift, self.copies)
@@ -98,13 +113,10 @@ class PolicyCondensed(Condensed):
         if base is None:
             return None
         N, m, Np = base.shape
-        entries = causal_entries(N, m, Np // N)
-        M = (
-            jnp.zeros((N * m, Np), z.dtype)
-            .at[tuple(entries.T)]
-            .set(z[N * m : N * m + len(entries)])
-        )
-        found = base + matmul(self.Omega[..., : N * m], M)
+        entries, first = causal_entries(N, m, Np // N), len(self.begins) * m
+        M = jnp.zeros((N * m, Np), z.dtype)
+        M = M.at[tuple(entries.T)].set(z[first : first + len(entries)])
+        found = base + matmul(self.of_answers, M)
         return found.reshape(N, m, N, Np // N)
 
 
@@ -113,34 +125,33 @@ def condensed_plan(mpc: MPC) -> Condensed:
     does not fit into memory, and for what plans of the policy are not computed with."""
     if mpc.disturbance is None or mpc.policy == "tightened":
         return condense(mpc)
-    require_plain_rows(mpc)
-    if mpc.soft:
-        cure = 'Leave them out, or give policy="tightened"'
-        fail("soft", f"rows given with policy {mpc.policy!r}", cure)
+    require_free_inputs(mpc)
     found = given_blocks(mpc, float)
+    plain = without_disturbance(mpc)
     if mpc.policy == "affine":
         require_generators(mpc.disturbance)
         require_memory("horizon", affine_bytes(mpc, found), "Give fewer steps, or another policy")
-        return _affine(*arrays((condense(without_disturbance(mpc)), mpc)))
+        nominal = each = condense(plain)
+        if mpc.control_horizon is not None:
+            each = condense(replace(plain, control_horizon=None, prestabilise=False))
+        return _affine(*arrays((nominal, each, mpc)))
     section, gain = tube_section(mpc), np.asarray(feedback_gain(mpc), float)
-    sides = tightened_by(section, found, gain)
-    steps = [len(b.steps) for b in found]
-    spread = lambda v, k: np.tile(np.asarray(v), (k, 1))
+    mpc = replace(mpc, disturbance=with_vertices(mpc.disturbance))
+    sides = tightened_by(mpc, section, found, gain)
     placed = [
-        replace(b, lower=spread(low, k), upper=spread(high, k))
-        for b, (low, high), k in zip(found, sides, steps, strict=True)
+        replace(b, lower=np.asarray(low), upper=np.asarray(high))
+        for b, (low, high) in zip(found, sides, strict=True)
     ]
     require_room(mpc, placed)
-    nominal = condense(without_disturbance(mpc))
-    return _tube(*arrays((nominal, mpc, gain, section)))
+    return _tube(*arrays((condense(plain), mpc, gain, section)))
 
 
-def require_plain_rows(mpc: MPC) -> None:
-    """Raise ValueError for rows and moves that affine policies and tubes do not know."""
-    for name in ("control_horizon", "input_rate_limit"):
-        if getattr(mpc, name) is not None:
-            cure = 'Leave it out, or give policy="tightened"'
-            fail(name, f"given with policy {mpc.policy!r}", cure)
+def require_free_inputs(mpc: MPC) -> None:
+    """Raise ValueError for a control horizon of a tube, whose inputs are those of a nominal plan
+    and of a feedback, which none holds."""
+    if mpc.policy == "tube" and mpc.control_horizon is not None:
+        what = "given with policy 'tube', whose plans are the inputs under the feedback too"
+        fail("control_horizon", what, 'Leave it out, or give policy="tightened" or "affine"')
 
 
 def require_generators(W: Any) -> None:
@@ -188,8 +199,11 @@ def _row_steps(found: Sequence[Block]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _values(found: Sequence[Block], x: Array, u: Array) -> Array:
-    """Return the rows (rows,) of states x (N+1, n) and inputs u (N, m)."""
-    return jnp.concatenate([b.values(x, u).ravel() for b in found] + [x[0, :0]])
+    """Return the rows (rows,) of states x (N+1, n) and inputs u (N, m), the input before the first
+    being the same as the first."""
+    rates = jnp.diff(u, axis=0, prepend=u[:1])
+    values = [b.values(x, rates if b.rate else u).ravel() for b in found]
+    return jnp.concatenate([*values, x[0, :0]])
 
 
 def generator_form(W: Any, dtype: DTypeLike) -> tuple[Array, Array]:
@@ -222,7 +236,7 @@ def _input_sizes(mpc: MPC, dtype: DTypeLike) -> tuple[Array, Array] | None:
 
 @compiled_lightly(0)
 @own_modes
-def _affine(nominal: Condensed, mpc: MPC) -> PolicyCondensed:
+def _affine(nominal: Condensed, each: Condensed, mpc: MPC) -> PolicyCondensed:
     dtype, N, n, m = nominal.P.dtype, mpc.horizon, mpc.system.n, mpc.system.m
     center, Gamma = generator_form(mpc.disturbance, dtype)
     p, g = Gamma.shape
@@ -249,7 +263,7 @@ def _affine(nominal: Condensed, mpc: MPC) -> PolicyCondensed:
     fixed = (j == last[:, None]) & ~moved[:, None]
     constant = jnp.sum(jnp.where(fixed[..., None], jnp.abs(reach), 0.0), axis=(1, 2))
     middle = jnp.sum(matmul(D, center), axis=1)
-    of_M = G[:, inputs]
+    of_M = each.C[:, inputs]
     answers = of_M[row] * Gamma[coordinate][:, generator].T * (at[:, None] == disturbed)
     sums = jnp.asarray(row == np.arange(len(step))[:, None], dtype)
     one = jnp.eye(len(row), dtype=dtype)
@@ -264,9 +278,11 @@ def _affine(nominal: Condensed, mpc: MPC) -> PolicyCondensed:
         # Σ_j |U_kj Γ| is at most half the width: of U_kj in units of w, then of M.
         in_w = jnp.minimum(jnp.max(jnp.abs(_inverse(Gamma)), axis=0), LARGE)
         most = jnp.tile(sizes[1], N)[:, None] * jnp.tile(in_w, N)
-        back, (plan, of_theta) = _plan_extent(
-            nominal, sizes[0] + matmul(most, jnp.abs(jnp.tile(center, N))).reshape(N, m)
+        back, ends = _plan_extent(
+            each, sizes[0] + matmul(most, jnp.abs(jnp.tile(center, N))).reshape(N, m)
         )
+        moves = (np.array(nominal.begins)[:, None] * m + np.arange(m)).ravel()
+        plan, of_theta = (v[moves] for v in ends)
         M = matmul(back, most + jnp.abs(response.reshape(N * m, N * p)))[tuple(places.T)]
         plan = jnp.append(plan, M)
         of_theta = jnp.pad(of_theta, ((0, len(M)), (0, 0)))
@@ -274,7 +290,13 @@ def _affine(nominal: Condensed, mpc: MPC) -> PolicyCondensed:
         above, below = jnp.abs(nominal.upper - d - constant), jnp.abs(nominal.lower - d + constant)
         room = jnp.minimum(above, below) + matmul(jnp.abs(value), plan)
         room_of_theta = jnp.abs(nominal.D) + matmul(jnp.abs(value), of_theta)
-        extent = jnp.append(plan, room[row]), jnp.concatenate([of_theta, room_of_theta[row]])
+        T, T_of_theta = room[row], room_of_theta[row]
+        if nominal.soft_linear is not None:
+            # A soft row leaves any room, but no T need be larger than what it bounds.
+            soft = jnp.isfinite(nominal.soft_linear)[row]
+            least = jnp.abs(reach[row, at, generator]) + matmul(jnp.abs(answers), plan)
+            T, T_of_theta = jnp.where(soft, least, T), jnp.where(soft[:, None], 0.0, T_of_theta)
+        extent = jnp.append(plan, T), jnp.concatenate([of_theta, T_of_theta])
         extent = jax.lax.stop_gradient(jax.tree.map(lambda v: jnp.minimum(v, LARGE), extent))
     return _widened(
         nominal,
@@ -283,6 +305,7 @@ def _affine(nominal: Condensed, mpc: MPC) -> PolicyCondensed:
         lower=jnp.concatenate([-free, nominal.lower, zero - jnp.inf, zero]),
         upper=jnp.concatenate([nominal.upper, free, zero, zero + jnp.inf]),
         response=response,
+        of_answers=each.Omega,
         extent=extent,
         copies=2,
     )
@@ -298,15 +321,30 @@ def _inverse(Gamma: Array) -> Array:
     return jnp.where(diagonal, jnp.diag(usual), other)
 
 
-def tightened_by(section: Zonotope, found: Sequence[Block], gain: Any) -> list[tuple[Any, Any]]:
-    """Return the bounds of each block that are left to the nominal trajectory of a tube."""
+def tightened_by(
+    mpc: MPC, section: Zonotope, found: Sequence[Block], gain: Any
+) -> list[tuple[Any, Any]]:
+    """Return the bounds (steps, r) of each block that are left to the nominal trajectory of a
+    tube."""
     sides = []
     for b in found:
         along: Any = 0.0 if b.H is None else b.H
         along = along if b.D is None else along + matmul(b.D, gain)
+        low: Any = 0.0
+        high: Any = 0.0
+        if b.rate:
+            A, B, _ = dynamics_of(mpc.system, along.dtype)
+            push: Any = along
+            if mpc.disturbance_matrix is not None:
+                push = matmul(along, jnp.asarray(mpc.disturbance_matrix, along.dtype))
+            low, high = worst(mpc.disturbance, -push), worst(mpc.disturbance, push)
+            along = matmul(along, A + matmul(B, gain)) - along
         middle = matmul(along, jnp.asarray(section.center, along.dtype))
         half = jnp.sum(jnp.abs(matmul(along, jnp.asarray(section.generators, along.dtype))), axis=1)
-        sides.append((b.lower - middle + half, b.upper - middle - half))
+        # The first rate is that of the input that is applied.
+        later = np.array([not (b.rate and k == 0) for k in b.steps], float)[:, None]
+        low, high = later * (low + half - middle), later * (high + half + middle)
+        sides.append((b.lower + low, b.upper - high))
     return sides
 
 
@@ -327,10 +365,7 @@ def _tube(nominal: Condensed, mpc: MPC, gain: Array, section: Zonotope) -> Polic
 
     center, generators = (jnp.asarray(v, dtype) for v in (section.center, section.generators))
     moves = jax.vmap(along)(generators.T).T
-    bounds = [
-        (jnp.tile(low, len(b.steps)), jnp.tile(high, len(b.steps)))
-        for b, (low, high) in zip(found, tightened_by(section, found, K), strict=True)
-    ]
+    bounds = [(low.ravel(), high.ravel()) for low, high in tightened_by(mpc, section, found, K)]
     lower, upper = (jnp.concatenate([*side, center[:0]]) for side in zip(*bounds, strict=True))
     count = generators.shape[1]
     one, zero = jnp.eye(count, dtype=dtype), jnp.zeros((count, nominal.C.shape[1]), dtype)
@@ -348,6 +383,7 @@ def _tube(nominal: Condensed, mpc: MPC, gain: Array, section: Zonotope) -> Polic
         lower=jnp.concatenate([lower, -jnp.ones(count, dtype)]),
         upper=jnp.concatenate([upper, jnp.ones(count, dtype)]),
         response=None,
+        of_answers=None,
         extent=extent,
         copies=1,
     )
@@ -360,6 +396,7 @@ def _widened(
     lower: Array,
     upper: Array,
     response: Any,
+    of_answers: Any,
     extent: Any,
     copies: int,
 ) -> PolicyCondensed:
@@ -380,6 +417,19 @@ def _widened(
         lower=lower,
         upper=upper,
     )
+    if nominal.soft_linear is not None:
+        longer = lambda v, rest: jnp.pad(
+            jnp.tile(v, copies), (0, len(C) - len(D)), constant_values=rest
+        )
+        made = replace(
+            made,
+            soft_linear=longer(nominal.soft_linear, jnp.inf),
+            soft_quadratic=longer(nominal.soft_quadratic, 0.0),
+        )
     return PolicyCondensed(
-        **vars(made), response_to_disturbances=response, extent=extent, copies=copies
+        **vars(made),
+        response_to_disturbances=response,
+        of_answers=of_answers,
+        extent=extent,
+        copies=copies,
     )

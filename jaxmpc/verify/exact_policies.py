@@ -55,6 +55,15 @@ class Dyadic(NamedTuple):
         """Return the transpose."""
         return Dyadic(self.values.T, self.e)
 
+    def head(self, count: int) -> "Dyadic":
+        """Return the first rows, or entries."""
+        return Dyadic(self.values[:count], self.e)
+
+    def above(self, other: "Dyadic") -> "Dyadic":
+        """Return two matrices or vectors, one above the other."""
+        e = max(self.e, other.e)
+        return Dyadic(np.concatenate([self.over(e), other.over(e)]), e)
+
     def columns(self, first: int, end: int | None) -> "Dyadic":
         """Return some of the columns."""
         return Dyadic(self.values[:, first:end], self.e)
@@ -160,6 +169,11 @@ class StoredPolicies:
         center, gamma = directions(described["set"])
         E = fractions(described["E"])
         push, middle = E @ gamma if gamma.size else 0 * E[:, :0], E @ center
+        self.states = len(E)
+        # Of u_{−1}, which is a part of the state where rates are limited.
+        more = self.rows.sizes[0] - self.states
+        push = np.vstack([push, np.full((more, push.shape[1]), Fraction(0), object)])
+        middle = np.append(middle, [Fraction(0)] * more)
         self.push, self.middle = Dyadic.of_fractions(push), Dyadic.of_fractions(middle)
         self.affine = None
         if not self.tube and push.size:
@@ -168,7 +182,8 @@ class StoredPolicies:
             self.gain = Dyadic.of(described["gain"])
             section = described["section"]
             self.section = Dyadic.of(section["center"]), Dyadic.of(section["generators"])
-            taken = taken_by_section(described, self.rows.H, self.rows.D)
+            r = self.rows
+            taken = taken_by_section(described, r.A[0], r.B[0], r.H, r.D)
             columns = [np.array(k, object).T for k in taken]
             self.taken = [[Dyadic.of_fractions(v) for v in pair] for pair in columns]
         self.state, self.plan, self.answer = (
@@ -198,6 +213,9 @@ class StoredPolicies:
         if not all(np.isfinite(v).all() for v in (theta, plan, answer)):
             return -np.inf
         x, N, g = self.start(theta), self.rows.N, self.push.values.shape[1]
+        begins = np.unique(self.rows.moves, return_index=True)[1]
+        if np.any(plan != plan[begins[self.rows.moves]]):
+            return -np.inf  # a control horizon holds it
         if self.tube:
             within = 1.0 - float(np.abs(answer).max(initial=0.0))
             return min(within, *self.closed_loop(x, plan, answer))
@@ -218,14 +236,18 @@ class StoredPolicies:
         z, least, nominal_least = x, np.inf, np.inf
         if self.tube:
             center, G = self.section
-            z = x.plus(center, -1).plus(G.times(Dyadic.of(answer)), -1)
+            off = center.plus(G.times(Dyadic.of(answer)))
+            if len(x0) > self.states:  # the first rate is that of the input that is applied
+                off = off.above(self.gain.times(off))
+            z = x.plus(off, -1)
         for k in range(p.N + 1):
             H = Dyadic.of(p.H[k])
             value, reach, planned = H.times(x), H.times(X), H.times(z)
             if k < p.N:
                 A, B, D, v = (Dyadic.of(w) for w in (p.A[k], p.B[k], p.D[k], plan[k]))
                 if self.tube:
-                    u, U = v.plus(self.gain.times(x.plus(z, -1))), self.gain.times(X)
+                    off = x.plus(z, -1).head(self.states)
+                    u, U = v.plus(self.gain.times(off)), self.gain.times(X.head(self.states))
                     z = A.times(z).plus(B.times(v)).plus(Dyadic.of(p.c[k]))
                 else:
                     u, U = v, Dyadic.of(answer[k][:, : k * g])
@@ -237,6 +259,10 @@ class StoredPolicies:
             moved = Dyadic(np.array([sum(row) for row in abs(reach.values)], object), reach.e)
             least = min(least, self._room(k, value, (moved, moved)))
             if self.tube:
+                if k == 0:  # u_{−1} itself is limited
+                    still = (p.H[0][:, : self.states] == 0).all(axis=1) & ~p.D[0].any(axis=1)
+                    e = max(value.e, planned.e)
+                    planned = Dyadic(np.where(still, value.over(e), planned.over(e)), e)
                 nominal_least = min(nominal_least, self._room(k, planned, self.taken[k]))
         return least, nominal_least
 

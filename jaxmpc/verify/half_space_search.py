@@ -243,15 +243,15 @@ class AffinePrograms(Programs):
 
     def beyond(self, y: Any, points: np.ndarray, box: tuple[np.ndarray, ...]) -> np.ndarray:
         """Return `exact.beyond` of the half-space that these multipliers imply."""
-        more = self.affine.more(y, *box[:2])
+        more = self.affine.more(y, *(ends[self.p.moves] for ends in box[:2]))
         if more is None:
             return np.full(len(points), -np.inf)
         return beyond(self.p, y.difference, points, box, more)
 
     def boxes(self) -> tuple[np.ndarray, ...]:
-        """Return lower and upper bounds (N, m) of the inputs and of the states that are not mapped:
-        the limits on each alone, ±∞ where there are none."""
-        size = self.p.N, self.p.sizes[1]
+        """Return lower and upper bounds (moves, m) of the inputs and of the states that are not
+        mapped: the limits on each alone, ±∞ where there are none."""
+        size = int(self.p.moves.max()) + 1, self.p.sizes[1]
         low, high = np.full(size, -np.inf), np.full(size, np.inf)
         for move, i, least, most in self.p.input_rows():
             low[move, i], high[move, i] = max(low[move, i], least), min(high[move, i], most)

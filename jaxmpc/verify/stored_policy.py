@@ -9,7 +9,8 @@ t_1 = (A + BK)'t_0 + K'd and t_{i+1} = (A + BK)'t_i; the largest sum of these is
 lose.
 
 *Tubes*: u_k = v_k + K (x_k − z_k), x_0 − z_0 in a section S = center + {G ζ : |ζ_i| ≤ 1}. The rows
-of z and v lose max {(a + K'b)'s : s ∈ S} at every step.
+of z and v lose max {(a + K'b)'s : s ∈ S} at every step. With d, from the second step on, x_k − z_k
+is (A + BK) s + E w with x_{k−1} − z_{k−1} = s; the first rate, K (x_0 − z_0) included, loses none.
 """
 
 from collections.abc import Iterator, Mapping
@@ -29,7 +30,7 @@ def fits(described: Any, n: int, m: int) -> bool:
     right = rows in (n, n - m) and p > 0 and _is_set(described["set"], p)
     if described["policy"] == "tube":
         section = described["section"]
-        right = right and "generators" in section and _is_set(section, n)
+        right = right and "generators" in section and _is_set(section, rows)
     affine = described["policy"] == "affine"
     return right and (affine or np.shape(described["gain"]) == (m, rows))
 
@@ -102,22 +103,65 @@ def tightened(
 
 
 def tightened_by_section(
-    described: Mapping[str, Any], H: Steps, D: Steps, lower: Steps, upper: Steps
+    described: Mapping[str, Any],
+    A: np.ndarray,
+    B: np.ndarray,
+    H: Steps,
+    D: Steps,
+    lower: Steps,
+    upper: Steps,
 ) -> tuple[tuple[Steps, Steps], tuple[Steps, Steps]]:
     """Return the same bounds of the rows of the nominal trajectory of a tube."""
-    return _both_ways(lower, upper, taken_by_section(described, H, D))
+    return _both_ways(lower, upper, taken_by_section(described, A, B, H, D))
 
 
 def taken_by_section(
-    described: Mapping[str, Any], H: Steps, D: Steps
+    described: Mapping[str, Any], A: np.ndarray, B: np.ndarray, H: Steps, D: Steps
 ) -> list[list[tuple[Fraction, Fraction]]]:
-    """Return what the section of a tube takes from the lower and the upper bound of each row of
-    each step."""
-    K, section, taken = fractions(described["gain"]), described["section"], []
-    for rows in _each_row(H, D):
-        along = [fractions(h) + fractions(d) @ K for h, d in rows]
-        taken.append([(largest(section, -g), largest(section, g)) for g in along])
+    """Return what a tube takes from the lower and the upper bound of each row of each step."""
+    K, section, E = fractions(described["gain"]), described["section"], fractions(described["E"])
+    n = len(E)
+    closed = fractions(A[:n, :n]) + fractions(B[:n]) @ K
+    nothing: dict[str, list[float]] = {"lower": [0.0] * E.shape[1], "upper": [0.0] * E.shape[1]}
+    taken = []
+    for k, rows in enumerate(_each_row(H, D)):
+        here = []
+        for h, d in rows:
+            along, before, W = fractions(h[:n]) + fractions(d) @ K, fractions(h[n:]), nothing
+            if any(before) and k == 0:
+                here.append((Fraction(0), Fraction(0)))
+                continue
+            push = along @ E
+            if any(before):
+                along, W = along @ closed + before @ K, described["set"]
+            low, high = (largest(section, g) + largest(W, w) for g, w in
+                         ((-along, -push), (along, push)))  # fmt: skip
+            here.append((low, high))
+        taken.append(here)
     return taken
+
+
+def first_rates(
+    described: Mapping[str, Any],
+    H: np.ndarray,
+    D: np.ndarray,
+    inner: tuple[np.ndarray, np.ndarray],
+    outer: tuple[np.ndarray, np.ndarray],
+) -> tuple[np.ndarray, list[np.ndarray], list[np.ndarray]]:
+    """Return what K (x_0 − z_0) adds to the rows of rates at the first step, in terms of ζ (r, g),
+    rounded, and the two pairs of bounds less the rest of it, rounded inwards and outwards."""
+    K, E = fractions(described["gain"]), np.shape(described["E"])
+    center, G = (fractions(described["section"][name]) for name in ("center", "generators"))
+    rates = H[:, E[0] :].any(axis=1) & D.any(axis=1)
+    along = np.where(rates[:, None], fractions(D), Fraction(0)) @ K
+    exact, middle = along @ G, along @ center
+    near = exact.astype(float)
+    off = abs(exact - fractions(near)).sum(axis=1) if exact.size else 0 * middle
+    sides = []
+    for i, ((lower, upper), sign) in enumerate(((inner, 1), (outer, -1))):
+        taken = list(zip(sign * off - middle, sign * off + middle, strict=True))
+        sides.append([side[0] for side in _both_ways([lower], [upper], [taken])[i]])
+    return near, *sides
 
 
 def _each_row(H: Steps, D: Steps) -> Iterator[list[tuple[list[float], list[float]]]]:

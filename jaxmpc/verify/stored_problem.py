@@ -9,6 +9,7 @@ import numpy as np
 from jaxmpc.checks import fail
 from jaxmpc.verify.stored_policy import (
     answer_shape,
+    first_rates,
     fits,
     tightened,
     tightened_by_section,
@@ -120,7 +121,8 @@ class Constraints:
             both = tightened(described, self.A[0], self.B[0], *as_given)
             (self.lower, self.upper), self.widest = both
         if described["policy"] == "tube":
-            (self.lower, self.upper), self.widest = tightened_by_section(described, *as_given)
+            both = tightened_by_section(described, self.A[0], self.B[0], *as_given)
+            (self.lower, self.upper), self.widest = both
         ball = plain["ellipsoid"]
         self.P = None if ball is None else np.zeros((n, n))
         if ball is not None:
@@ -135,21 +137,30 @@ class Constraints:
             self.low = bound(others.get("lower", []), -np.inf)
             self.high = bound(others.get("upper", []), np.inf)
         if described["policy"] == "tube":
-            self._begin_anywhere(described["section"])
+            self._begin_anywhere(described)
 
-    def _begin_anywhere(self, section: Mapping[str, Any]) -> None:
+    def _begin_anywhere(self, described: Mapping[str, Any]) -> None:
         """Put the step z_0 = θ − center − G ζ before all others."""
+        section = described["section"]
         center, G = (np.asarray(section[name], float) for name in ("center", "generators"))
-        (n, m), g = self.sizes, G.shape[1]
+        (n, m), g, states = self.sizes, G.shape[1], len(center)
+        center = np.append(center, np.zeros(n - states))
         wider = lambda M: np.pad(M, [(0, g)] * M.ndim)
         A, B, c = wider(self.A[0]), np.pad(self.B[0], [(0, g), (0, 0)]), wider(self.c[0])
         start = np.zeros((n + g, n + g))
-        start[:n, :n], start[:n, n:] = np.eye(n), -G
+        start[:n, :n], start[:states, n:] = np.eye(n), -G
         self.A, self.B, self.c = [start, *[A] * self.N], [0 * B, *[B] * self.N], [c] * self.N
         self.c = [-np.append(center, np.zeros(g)), *self.c]
         self.H = [np.zeros((0, n + g)), *(np.pad(H, [(0, 0), (0, g)]) for H in self.H)]
         self.D = [np.zeros((0, m)), *self.D]
         lower, upper = self.widest
+        if n > states:
+            start[n:, n:] = np.eye(g)
+            sides = (self.lower[0], self.upper[0]), (lower[0], upper[0])
+            rows = self.H[1][:, :n], self.D[1]
+            self.H[1][:, n:], inner, outer = first_rates(described, *rows, *sides)
+            self.lower, self.upper = [inner[0], *self.lower[1:]], [inner[1], *self.upper[1:]]
+            lower, upper = [outer[0], *lower[1:]], [outer[1], *upper[1:]]
         first = [np.zeros(0)]
         self.lower, self.upper = first + self.lower, first + self.upper
         self.widest = first + lower, first + upper

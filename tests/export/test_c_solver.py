@@ -80,6 +80,10 @@ CASES = {
 }  # fmt: skip
 # So few steps solve none of their plans.
 POLICIES = {policy: (partial(robust, policy), STEPS) for policy in ("tube", "affine")}
+POLICIES["affine, more"] = partial(
+    robust, "affine", input_rate_limit=0.4, control_horizon=(1, 2),
+    soft=jm.Soft([[1.0, 0.5]], upper=[0.1], rho=2.0),
+), STEPS  # fmt: skip
 
 
 class Compiled:

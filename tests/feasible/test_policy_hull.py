@@ -139,6 +139,68 @@ def test_no_label_is_wrong(seed):
         assert least_violation(mpc, points[i]) > 0
 
 
+def margin_of_any_policy(mpc: jm.MPC, start: np.ndarray) -> float:
+    """Return the largest margin that all rows can keep from `start` (x, and u_{−1} where rates are
+    limited), by one linear program (SciPy) with an input for each sequence of past vertices."""
+    (n, m), N = mpc.system.B.shape, mpc.horizon
+    A, B = np.asarray(mpc.system.A), np.asarray(mpc.system.B)
+    E = np.eye(n) if mpc.disturbance_matrix is None else np.asarray(mpc.disturbance_matrix)
+    ends = zip(np.asarray(mpc.disturbance.lower), np.asarray(mpc.disturbance.upper), strict=True)
+    pushes = [E @ w for w in itertools.product(*ends)]
+    count = m * sum(len(pushes) ** k for k in range(N)) + 1
+    unit, taken, rows, bounds = np.eye(count), 0, [], []
+
+    def limit(set_, M, c):
+        """Ask H (M z + c) + t ≤ h."""
+        H, h = (np.asarray(v) for v in (set_.to_polytope().H, set_.to_polytope().h))
+        rows.extend(H @ M + unit[-1])
+        bounds.extend(h - H @ c)
+
+    still, rates = None, None
+    if mpc.rate_limited:
+        still = np.zeros((m, count)), start[n:]
+        rates = jm.Box(-mpc.input_rate_limit, mpc.input_rate_limit)
+    level = [(np.zeros((n, count)), start[:n], still)]
+    for _ in range(N):
+        later = []
+        for M, c, before in level:
+            u = unit[taken : taken + m]
+            taken += m
+            limit(mpc.states, M, c)
+            limit(mpc.inputs, u, np.zeros(m))
+            if before is not None:
+                limit(rates, u - before[0], -before[1])
+            after = None if before is None else (u, np.zeros(m))
+            later += [(A @ M + B @ u, A @ c + push, after) for push in pushes]
+        level = later
+    for M, c, _ in level:
+        limit(mpc.terminal_set, M, c)
+    free = [(None, None)] * (count - 1) + [(None, 1.0)]
+    return -linprog(-unit[-1], np.array(rows), np.array(bounds), bounds=free).fun
+
+
+@pytest.mark.parametrize("rates", [None, np.array([1.1])])
+@pytest.mark.parametrize("policy", ["tightened", "tube"])
+def test_labels_about_any_policy(policy, rates):
+    """Against a linear program over trees of inputs; the class has no say in them."""
+    smaller = jm.Box([-0.1, -0.1], [0.1, 0.1])
+    some = {} if rates is None else {"input_rate_limit": rates, "disturbance": smaller}
+    mpc = double(policy=policy, horizon=3, **some)
+    d = 2 if rates is None else 3
+    points = np.random.default_rng(0).uniform(-1, 1, (60, d)) * [4.5, 2.2, 1.0][:d]
+    found = jm.map_feasible_set(mpc, points)
+    labels = found.any_policy_labels()
+    truth = np.array([margin_of_any_policy(mpc, x) for x in points])
+    assert np.all(np.abs(truth) > 1e-6)
+    np.testing.assert_array_equal(labels, np.sign(truth))
+    lost = found.label == -1
+    assert np.sum(lost & (labels == -1)) > 5
+    assert rates is not None or np.sum(lost & (labels == 1)) > 0
+    assert "any_policy_labels" in found.claim
+    nominal = jm.map_feasible_set(jm.MPC(SYSTEM, np.eye(2), 0.1, 3, X, U), points[:, :2])
+    np.testing.assert_array_equal(nominal.any_policy_labels(), nominal.label)
+
+
 def test_the_double_integrator_of_the_literature():
     """Area of the exact set by dynamic programming (`predecessor`), by rays, and as a polytope."""
     mpc = double()
@@ -149,7 +211,8 @@ def test_the_double_integrator_of_the_literature():
     any_policy = any_policy_polytope(mpc)
     np.testing.assert_allclose(any_policy.volume(), exact.volume(), rtol=1e-12)
     with pytest.raises(ValueError, match="has other limits"):
-        any_policy_polytope(double(policy="tightened", input_rate_limit=1.0))
+        outputs = jm.mpc.Outputs([[1.0, 1.0]], upper=[5.0])
+        any_policy_polytope(double(policy="tightened", outputs=outputs))
     found = feasible_polytope(mpc)
     assert found.is_subset(exact, 1e-7)
     np.testing.assert_allclose(found.volume(), 35.7903, atol=1e-4)

@@ -290,11 +290,152 @@ def test_sizes_of_the_disturbance(policy):
                 jax.grad(cost)(0.15)
 
 
+class Rows:
+    """Linear rows over all variables, collected, and the least cost that they allow."""
+
+    def __init__(self, mpc: jm.MPC, x0: np.ndarray, before: np.ndarray, more: int):
+        """Variables: `more` of them, then a slack for each soft row and step."""
+        self.mpc, self.x0, self.before = mpc, x0, before
+        self.soft = mpc.soft if isinstance(mpc.soft, jm.Soft) else None
+        self.more = more
+        self.total = more + (0 if self.soft is None else mpc.horizon + 1)
+        self.G, self.g = [-np.eye(self.total)[more:]], [np.zeros(self.total - more)]
+
+    def ask(self, M: np.ndarray, c: np.ndarray, H: np.ndarray, h: np.ndarray) -> None:
+        """Ask H (M z + c) <= h."""
+        self.G.append(H @ M)
+        self.g.append(h - H @ c)
+
+    def roll(self, u: np.ndarray, u_c: np.ndarray, start: tuple, w: np.ndarray) -> list:
+        """Return x_0 … x_N as pairs (matrix, constant) of inputs u (N, V) and u_c (N,)."""
+        x = [start]
+        for k in range(len(u)):
+            M, c = x[-1]
+            x.append((A @ M + B @ u[k : k + 1], A @ c + B[:, 0] * u_c[k] + w[k]))
+        return x
+
+    def limit(self, x: list, s: np.ndarray, u: np.ndarray, u_c: np.ndarray) -> None:
+        """Ask the limits of states x_k + s and inputs, and the soft row."""
+        N = self.mpc.horizon
+        for k, (M, c) in enumerate(x):
+            self.ask(M, c + s, *(self.mpc.states if k < N else self.mpc.terminal_set).half_spaces())
+            if self.soft is not None:
+                C, e = np.asarray(self.soft.C), np.eye(self.total)[self.more + k]
+                for sign, bound in ((1, self.soft.upper), (-1, -np.asarray(self.soft.lower))):
+                    self.ask(sign * C @ M - e, sign * C @ (c + s), np.eye(1), np.asarray(bound))
+        for sign in (1, -1):
+            self.ask(sign * u, sign * u_c, np.eye(N), np.ones(N))
+
+    def rate(self, M: np.ndarray, c: float) -> None:
+        """Ask |M z + c| <= the limit of the rate."""
+        if self.mpc.input_rate_limit is not None:
+            most = np.asarray(self.mpc.input_rate_limit)
+            for sign in (1, -1):
+                self.ask(sign * M[None], np.array([sign * c]), np.eye(1), most)
+
+    def least(self, u: np.ndarray, u_c: np.ndarray, start: tuple) -> float:
+        """Return the least cost of the undisturbed plan, ∞ where the rows leave nothing."""
+        N = self.mpc.horizon
+        x = self.roll(u, u_c, start, np.zeros((N, 2)))
+        weights = [np.eye(2)] * N + [np.asarray(self.mpc.terminal_cost)]
+        P, q = 0.2 * u.T @ u, 0.2 * u.T @ u_c
+        constant = 0.1 * u_c @ u_c
+        for (M, c), Q in zip(x, weights, strict=True):
+            P, q, constant = P + 2 * M.T @ Q @ M, q + 2 * M.T @ Q @ c, constant + c @ Q @ c
+        if self.soft is not None:
+            q[self.more :] += float(self.soft.rho)
+            P[self.more :, self.more :] += 2 * float(self.soft.quadratic) * np.eye(N + 1)
+        G, h = np.vstack(self.G), np.concatenate(self.g)
+        found = daqp.solve(P + 1e-9 * np.eye(self.total), q, G, h, np.full(len(h), -1e30),
+                           np.zeros(len(h), np.int32))  # fmt: skip
+        return found[1] + constant if found[2] > 0 else np.inf
+
+
+def least_cost_of_affine(mpc: jm.MPC, x0: np.ndarray, before: np.ndarray) -> float:
+    """With the rows of every sequence of vertices."""
+    N, moves = mpc.horizon, np.array(mpc.moves)
+    entries = [(k, j, q) for k in range(N) for j in range(k) for q in range(2)]
+    free = moves.max() + 1
+    rows = Rows(mpc, x0, before, free + len(entries))
+    start = np.zeros((2, rows.total)), x0
+
+    def inputs(w: np.ndarray) -> np.ndarray:
+        u = np.zeros((N, rows.total))
+        u[np.arange(N), moves] = 1.0
+        for e, (k, j, q) in enumerate(entries):
+            u[k, free + e] = w[j, q]
+        return u
+
+    for w in sequences(mpc):
+        u = inputs(w)
+        rows.limit(rows.roll(u, np.zeros(N), start, w), np.zeros(2), u, np.zeros(N))
+        for k in range(N):
+            rows.rate(u[k] - u[k - 1] if k else u[0], 0.0 if k else -before[0])
+    return rows.least(inputs(np.zeros((N, 2))), np.zeros(N), start)
+
+
+def least_cost_of_tube(mpc: jm.MPC, x0: np.ndarray, before: np.ndarray) -> float:
+    """With the rows of every vertex of the section, and for rates of W. Variables (z_0, v)."""
+    N, K = mpc.horizon, np.asarray(LAW.K)
+    S = jm.sets.minimal_robust_invariant_set(SYSTEM, K, mpc.disturbance).to_zonotope().to_polytope()
+    closed, rows = A + B @ K, Rows(mpc, x0, before, 2 + N)
+    e_0 = -np.eye(2, rows.total), x0
+    rows.ask(*e_0, *S.half_spaces())
+    v = np.eye(N, rows.total, 2)
+    z = rows.roll(v, np.zeros(N), (np.eye(2, rows.total), np.zeros(2)), np.zeros((N, 2)))
+    for s in S.vertices():
+        rows.limit(z, s, v, np.full(N, (K @ s)[0]))
+        for k in range(1, N):
+            for w in mpc.disturbance.vertices():
+                rows.rate(v[k] - v[k - 1], (K @ (closed @ s - s + w))[0])
+    rows.rate(v[0] + (K @ e_0[0])[0], (K @ x0)[0] - before[0])
+    powers = [np.linalg.matrix_power(closed, k) for k in range(N)]
+    u = v + np.array([(K @ M @ e_0[0])[0] for M in powers])
+    u_c = np.array([(K @ M @ x0)[0] for M in powers])
+    return rows.least(u, u_c, (np.zeros((2, rows.total)), x0))
+
+
+SOFT = jm.Soft([[0.3, 1.0]], lower=[-0.5], upper=[0.5], rho=2.0, quadratic=1.0)
+RATES = {"input_rate_limit": [1.1]}
+MORE = [
+    ("affine", {"soft": SOFT, "control_horizon": (1, 2), **RATES}),
+    ("tube", {"soft": SOFT, **RATES}),
+    *(
+        pytest.param(policy, fields, marks=pytest.mark.slow)
+        for policy, fields in [
+            ("affine", {"soft": SOFT}), ("affine", {"control_horizon": 2}), ("affine", RATES),
+            ("tube", {"soft": SOFT}), ("tube", RATES),
+        ]
+    ),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("policy", "fields"), MORE)
+def test_soft_rows_rates_and_blocks(policy, fields):
+    """The least cost is that of DAQP with all vertices; a map says where there is a plan."""
+    mpc = robust(policy, disturbance=jm.Box([-0.1, -0.05], [0.05, 0.1]), **fields)
+    before, costs = np.array([-0.2]), []
+    points = np.vstack([STATES[:4] + [0.1, 0.0], [4.5, 1.8]])
+    least = least_cost_of_affine if policy == "affine" else least_cost_of_tube
+    with enable_x64():
+        controller = jm.Controller(mpc)
+        for x0 in points:
+            plan, cost = controller.plan(x0, previous_input=before), least(mpc, x0, before)
+            assert (plan.status == jm.Status.SOLVED) == np.isfinite(cost)
+            if np.isfinite(cost):
+                np.testing.assert_allclose(plan.cost, cost, rtol=1e-6)
+            costs.append(cost)
+    assert 3 <= np.isfinite(costs).sum() < len(points)
+    if mpc.rate_limited:
+        points = np.column_stack([points, np.repeat(before, len(points))])
+    labels = jm.map_feasible_set(mpc, points).label
+    np.testing.assert_array_equal(labels, np.where(np.isfinite(costs), 1, -1))
+
+
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"soft": jm.Soft(np.eye(2), upper=[1.0, 1.0])}, "soft: rows given with policy 'affine'"),
-        ({"control_horizon": 2}, "control_horizon: given with policy 'affine'"),
+        ({"policy": "tube", "control_horizon": 2}, "control_horizon: given with policy 'tube'"),
         ({"disturbance": jm.Polytope([[1.0, 1.0], [-1.0, 0.0], [0.0, -1.0]], [0.1] * 3)},
          "disturbance: is a Polytope, and affine policies answer to generators"),
         ({"policy": "tube", "disturbance": jm.Box([-1.0, -1.0], [1.0, 1.0])},

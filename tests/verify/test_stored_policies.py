@@ -65,6 +65,28 @@ def test_proves_all_labels(tmp_path, monkeypatch, policy, rounds):
         assert (result.exactly == decided) == exact
 
 
+MORE = [
+    ("affine", {"input_rate_limit": [0.8], "control_horizon": (1, 2)}),
+    ("tube", {"input_rate_limit": [1.2]}),
+    pytest.param("affine", {"control_horizon": 2}, marks=pytest.mark.slow),
+]
+
+
+@pytest.mark.parametrize(("policy", "fields"), MORE)
+def test_proves_labels_of_rates_and_blocks(tmp_path, policy, fields):
+    """The gain of the tube gives previous inputs a part in its first rate."""
+    mpc = double(policy, disturbance=jm.Box([-0.05, -0.04], [0.03, 0.05]), **fields)
+    lines = [np.linspace(-5.3, 5.3, 9), np.linspace(-2.1, 2.1, 10)]
+    lines += [np.array([-1.01, -0.9, 0.3, 0.8])] if mpc.rate_limited else []
+    path = tmp_path / "sweep.zarr"
+    found = sweep_into(path, mpc, lines)
+    label = found.store.read("label")
+    assert min(np.sum(label == v) for v in (1, -1)) > 25 and np.mean(label != 0) > 0.95
+    result = verify_map(path, exact=True)
+    assert result.passed, (result.failures, result.problems)
+    assert result.verified == result.exactly == np.count_nonzero(label)
+
+
 @pytest.mark.parametrize("policy", ["affine", "tube"])
 def test_finds_what_is_wrong(tmp_path, policy, monkeypatch):
     """A wrong label of either kind, a wrong cone or plan; a policy that breaks a limit makes wrong
