@@ -264,8 +264,8 @@ def test_slices_and_recursion():
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"control_horizon": 2}, "control_horizon: given with policy 'affine'"),
-        ({"input_rate_limit": 1.0}, "input_rate_limit: given with policy 'affine'"),
+        ({"policy": "tube", "control_horizon": 2}, "control_horizon: given with policy 'tube'"),
+        ({"input_rate_limit": 1.0}, "Give points .B, 3.: states, then previous inputs"),
         ({"inputs": None}, "inputs: are in no bounded Box"),
         ({"gain": K}, "gain: given with affine policies"),
         ({"disturbance": W.to_polytope()}, "affine policies answer to generators"),
