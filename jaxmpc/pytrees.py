@@ -162,9 +162,12 @@ def _literal(name: str, value: Any) -> Any:
 
 def short_text(instance: Any, **texts: str) -> str:
     """Return a dataclass or NamedTuple as a few lines of text: of large or traced arrays type and
-    shape, and no fields that have their defaults. texts: of some fields, in place of theirs."""
+    shape, and no fields that have their defaults. texts: of some fields, in place of theirs; these
+    come first."""
     is_record = dataclasses.is_dataclass(instance)
     names = [f.name for f in dataclasses.fields(instance)] if is_record else instance._fields
+    order = list(texts)
+    names = sorted(names, key=lambda name: order.index(name) if name in texts else len(order))
     parts = [
         f"{name}={texts.get(name) or short_value(getattr(instance, name))}".replace(" ", UNBROKEN)
         for name in names

@@ -486,8 +486,8 @@ CALLS = [
         lambda: jm.map_feasible_set(M, np.zeros((3, 1)), axes=(0.5,)),
     ),
     (
-        "fixed: shape (1,) where (2,) is needed.",
-        lambda: jm.map_feasible_set(M, np.zeros((3, 1)), axes=(0,), fixed=[1]),
+        "fixed: shape (3,). Give a value for each of the other states, (1,), or of all, (2,)",
+        lambda: jm.map_feasible_set(M, np.zeros((3, 1)), axes=(0,), fixed=[1, 2, 3]),
     ),
     (
         "fixed: 'ab' where real numbers are",

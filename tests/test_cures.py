@@ -51,6 +51,36 @@ def test_points_of_a_map_with_limited_rates():
         jm.map_feasible_set(mpc, np.zeros((3, 2)))
     assert jm.map_feasible_set(mpc, np.zeros((3, 3))).label.tolist() == [1, 1, 1]
 
+    slice_ = r"map a slice: axes=\[0, 1\], fixed=\[0\]"
+    with pytest.raises(ValueError, match=slice_):
+        jm.map_feasible_set(mpc, np.zeros((3, 2)))
+    short, whole = (
+        jm.map_feasible_set(mpc, np.zeros((3, 2)), axes=[0, 1], fixed=fixed)
+        for fixed in ([0.1], [7, 7, 0.1])
+    )
+    np.testing.assert_array_equal(short.fixed, [0, 0, 0.1])
+    np.testing.assert_array_equal(whole.fixed, short.fixed)
+    with pytest.raises(ValueError, match=r"fixed: shape \(2,\).*other states, \(1,\), or of all"):
+        jm.map_feasible_set(mpc, np.zeros((3, 2)), axes=[0, 1], fixed=[0, 0])
+    meaning = short.to_xarray().bound_normal.attrs["long_name"]
+    assert meaning == "a of a half-space a'x <= b that holds all feasible states"
+
+
+def test_an_infeasible_plan_does_not_look_like_a_plan():
+    """Its text begins with the status and holds no cost; its multipliers are no sensitivities, and
+    the cure that the refusal names finds the limits."""
+    mpc, x0 = problem(terminal_set=jm.Box([-0.01, -0.01], [0.01, 0.01])), [1.0, 1.0]
+    plan = jm.solve(mpc, x0)
+    assert repr(plan).startswith("Plan(status=PRIMAL_INFEASIBLE, cost=none, states=")
+    with pytest.raises(ValueError, match="plan: is PRIMAL_INFEASIBLE") as refusal:
+        jm.mpc.active_constraints(mpc, plan)
+    call = str(refusal.value).split("Ask ")[1].split(" which")[0]
+    soft = eval(call, {"jm": jm, "mpc": mpc, "x0": x0})
+    assert soft.solved and soft.slack.max() > 0.5
+    found = jm.mpc.active_constraints(jm.soften(mpc, rho=1e3), soft)
+    assert max(row.violation for row in found) == pytest.approx(float(soft.slack.max()))
+    assert repr(soft).startswith("Plan(status=SOLVED, states=")
+
 
 def test_hypotheses_name_no_terminal_set_that_is_not_there():
     report = jm.sets.verify_terminal(

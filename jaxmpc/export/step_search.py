@@ -6,6 +6,8 @@ states; all values of a penalty are tried in one batch. The number of steps is d
 suffices.
 """
 
+import sys
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -41,6 +43,7 @@ def choose_steps(
     plans: int = 1000,
     tolerance: float = 1e-6,
     seed: int = 1,
+    progress: bool = False,
 ) -> ADMM:
     """Return the solver for `export_c` whose fixed steps solve most plans of closed loops.
 
@@ -49,7 +52,9 @@ def choose_steps(
     policies and tubes 480, 960, ..., 7,680, with the usual penalties.
     share: of the plans that have a solution, which should be solved. plans: of the closed loops
     that are looked at. tolerance: as in `export_c`. seed: of the initial states; those by which
-    `check_fixed_steps` then measures the result are others.
+    `check_fixed_steps` then measures the result are others. progress: print each number of
+    iterations that is tried on stderr, with the share that it solves. Each is another program,
+    which compiles for half a minute on two cores.
 
     The penalties are local optima of a coarse search: `tune_solver` finds better ones. Raises
     ValueError as `check_fixed_steps` does.
@@ -70,17 +75,26 @@ def choose_steps(
         if isinstance(precise.condensed, PolicyCondensed):
             kinds, fewest, most = kinds[:0], FEWEST_OF_POLICIES, MOST_OF_POLICIES
         steps = fewest if iterations is None else iterations
+        begun = time.monotonic()
+
+        def say(what: str) -> None:
+            if progress:
+                print(f"{time.monotonic() - begun:6.1f} s  {what}", file=sys.stderr, flush=True)
+
         while True:
+            say(f"{steps:,} iterations")
             make = lambda rho, steps=steps: Controller(
                 mpc, ADMM(iterations=steps, rho=rho, newton_steps=0, eps=tolerance)
             )
             rho, reached = _improved(make, starts, -(-plans // LOOPS), rho, kinds)
             solver = ADMM(iterations=steps, rho=rho, newton_steps=0)
+            say(f"{steps:,} iterations solve {reached:.1%} of the plans")
             if iterations is not None or reached >= share or steps >= most:
                 return solver
             # Not every plan need have a solution: then precise plans say how many have.
             if most == MOST:
                 found = check_fixed_steps(mpc, solver, lower, upper, plans, tolerance, seed)
+                say(f"and {found.reached:,} of the {found.solvable:,} that have a solution")
                 if found.reached >= share * found.solvable:
                     return solver
             steps *= 2

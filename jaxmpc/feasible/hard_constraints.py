@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxmpc.arrays import Reals
-from jaxmpc.checks import fail, require_finite, require_shape
+from jaxmpc.arrays import Reals, host_array
+from jaxmpc.checks import fail, require_finite
 from jaxmpc.mpc.problem import MPC, at_stage, differing
 from jaxmpc.mpc.rows import Block, given_blocks
 from jaxmpc.mpc.tightening import require_room, require_tightened, with_bounds
@@ -67,8 +67,9 @@ class View:
 def make_view(mpc: MPC, axes: Axes = None, fixed: Reals | None = None) -> View:
     """Check and complete the choice of states to map; raise ValueError for a wrong one.
 
-    axes: indices or names of the mapped states, None for all. fixed: values (n,) of all states
-    (those at `axes` are ignored) for a slice, None for a projection along the others.
+    axes: indices or names of the mapped states, None for all. fixed: values of the other states
+    (n − d,), in their order, or of all (n,), of which those at `axes` are ignored, for a slice;
+    None for a projection along the others.
     """
     n = mpc.dimension
     names = list(mpc.system.state_names)
@@ -81,10 +82,13 @@ def make_view(mpc: MPC, axes: Axes = None, fixed: Reals | None = None) -> View:
         fail("axes", f"{axes}", f"Give different state indices from 0 to {n - 1}")
     others = tuple(i for i in range(n) if i not in axes)
     if fixed is not None and others:
-        require_shape("fixed", fixed, (n,), "One value for each state; those at axes are ignored")
-        require_finite("fixed", np.asarray(fixed, float)[list(others)])
-        fixed = np.asarray(fixed, np.float64)
-        return View(axes, others, np.where(np.isin(np.arange(n), others), fixed, 0.0), None, None)
+        given, values = host_array("fixed", fixed), np.zeros(n)
+        if given.shape not in ((n,), (len(others),)):
+            cure = f"Give a value for each of the other states, ({len(others)},), or of all, ({n},)"
+            fail("fixed", f"shape {given.shape}", cure)
+        values[list(others)] = given if len(given) < n else given[list(others)]
+        require_finite("fixed", values)
+        return View(axes, others, values, None, None)
     constrained = others and 0 in mpc.state_stages
     sides = set_bounds(mpc.states if constrained else None, mpc.system.n)
     if n > mpc.system.n:  # a previous input is one that could be applied

@@ -41,6 +41,11 @@ BOUNDS = {
     "bound_normal": ("facet", "coordinate"),
     "bound_offset": ("facet",),
 }
+MEANINGS = {
+    "bound_point": "state at the end of a ray that is proved feasible",
+    "bound_normal": "a of a half-space a'x <= b that holds all feasible states",
+    "bound_offset": "b of a half-space a'x <= b that holds all feasible states",
+}
 
 
 @record
@@ -262,12 +267,15 @@ class FeasibleSetMap:
         further["answer"] = ("time", "input", "cause", "direction")
         if self.mpc.policy == "tube":
             further["answer"] = ("generator",)
-        data = {
+        data: dict[str, Any] = {
             name: (("sample", *further.get(name, ())), value)
             for name, value in self.labels.arrays().items()
         }
         data["x0"] = ("sample", "coordinate"), self.x0s
-        data |= {name: (dimensions, getattr(self, name)) for name, dimensions in BOUNDS.items()}
+        data |= {
+            name: (axes, getattr(self, name), {"long_name": MEANINGS[name]})
+            for name, axes in BOUNDS.items()
+        }
         names = {
             "coordinate": list(self.axis_names),
             "state": list(self.mpc.labels),
@@ -340,8 +348,9 @@ def map_feasible_set(
     """Label each point: is there an input sequence that keeps every hard constraint of `mpc`?
 
     x0s: points (B, d). axes: indices or names of the d mapped states (None: all n). fixed: values
-    (n,) of all states, for a slice through them; None with d < n: a projection (feasible if some
-    value of the other states is).
+    of the other states (n − d,), or of all (n,), for a slice through them; None with d < n: a
+    projection (feasible if some value of the other states is). Where input rates are limited the
+    previous inputs are states too.
     iterations, dtype: of the ADMM stage alone; they cannot make a label wrong.
     chunk: number of points that a compiled program takes at once (None: by device).
     gap: call `FeasibleSetMap.refine` with this gap, None to skip it. progress: show a bar.
@@ -433,7 +442,9 @@ def _require_points(problem: FeasibilityProblem, points: np.ndarray) -> None:
     if points.ndim != 2 or points.shape[1] != d:
         columns = f"points (B, {d}), one column a mapped state"
         if problem.mpc.rate_limited and points.shape[1:] == (problem.mpc.system.n,):
-            columns = f"points (B, {d}): states, then previous inputs, for rates are limited"
+            n = problem.mpc.system.n
+            columns = f"points (B, {d}): states, then previous inputs, for rates are limited; or "
+            columns += f"map a slice: axes={list(range(n))}, fixed={[0] * (d - n)}"
         fail("x0s", f"shape {points.shape}", f"Give {columns}")
 
 

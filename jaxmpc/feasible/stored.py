@@ -26,7 +26,7 @@ from jaxmpc.arrays import Reals
 from jaxmpc.batches import CHUNK, Part, Timing, default_chunk, work_off
 from jaxmpc.checks import fail
 from jaxmpc.feasible.hard_constraints import Axes
-from jaxmpc.feasible.map import BOUNDS, EXECUTOR, FeasibleSetMap, excluded
+from jaxmpc.feasible.map import BOUNDS, EXECUTOR, MEANINGS, FeasibleSetMap, excluded
 from jaxmpc.feasible.pipeline import (
     MOST_PROGRAMS,
     PROOFS,
@@ -160,8 +160,9 @@ class StoredMap:
                 points = mesh(self.along, self.store.samples(block))
                 self._count(block, before, -1)
                 self._count(block, excluded(before, exact, points, normals, offsets))
+        about = {name: {"long_name": meaning} for name, meaning in MEANINGS.items()}
         self.store.save(
-            {name: Constant(getattr(alone, name), axes) for name, axes in BOUNDS.items()}
+            {name: Constant(getattr(alone, name), BOUNDS[name], about[name]) for name in BOUNDS}
         )
         old = self.bounds
         return self._with_bounds(

@@ -20,7 +20,7 @@ from jaxmpc.pytrees import named_pytree, pytree
 from jaxmpc.qp.linalg import apply, arrays
 from jaxmpc.qp.problem import QPSolution
 from jaxmpc.qp.residuals import with_fault
-from jaxmpc.qp.status import Status, WithStatus
+from jaxmpc.qp.status import NO_SOLUTION, Status, WithStatus
 from jaxmpc.sets.convex_sets import Box, Ellipsoid
 
 
@@ -483,8 +483,15 @@ def active_constraints(
     (inputs of one block of a control horizon, states at N beside the terminal set) they share it in
     an arbitrary way: only their sum is a sensitivity, of relaxing all of them. NumPy; not
     traceable.
+
+    Raises ValueError for a plan that there is not, such as an infeasible one: its multipliers
+    belong to a proof, and are no sensitivities.
     """
     y = np.asarray(flat_multipliers(layout(mpc), plan.multipliers), np.float64)
+    if int(plan.status) in NO_SOLUTION:
+        what = f"is {Status(int(plan.status)).name}, so that no limit shapes it"
+        cure = "Ask jm.solve(jm.soften(mpc, rho=1e3), x0) which limits it breaks"
+        fail("plan", what, cure)
     ball = isinstance(mpc.terminal_set, Ellipsoid)
     slack, columns = np.asarray(plan.slack), soft_columns(mpc)
     found = []

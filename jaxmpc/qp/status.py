@@ -34,6 +34,16 @@ class Status(IntEnum):
         return _SENTENCES[self]
 
 
+# Of these there is no point that the numbers beside the status could be close to.
+NO_SOLUTION = (
+    Status.NOT_RUN,
+    Status.PRIMAL_INFEASIBLE,
+    Status.DUAL_INFEASIBLE,
+    Status.NON_CONVEX,
+    Status.NON_FINITE,
+)
+
+
 class WithStatus:
     """A result with the `status` of one instance, or of each instance of a batch."""
 
@@ -53,8 +63,12 @@ class WithStatus:
         return Status(int(self.status)).sentence
 
     def __repr__(self) -> str:
-        """Return a few lines of text, without large arrays."""
-        return short_text(self, status=status_text(self.status))
+        """Return a few lines of text, without large arrays: the status first, and a cost only
+        where there is a solution."""
+        texts = {"status": status_text(self.status)}
+        if any(status.name == texts["status"] for status in NO_SOLUTION):
+            texts["cost"] = "none"
+        return short_text(self, **texts)
 
 
 def status_text(status: Array) -> str:

@@ -59,6 +59,11 @@ def test_it_makes_a_robust_problem_that_is_read_back(tmp_path):
         ("[disturbance]", "[disturbance]\ngain = [[1.0]]", "disturbance.gain: shape"),
         ("[disturbance]", "[disturbance]\nE = [[1.0, 0.0]]", "disturbance.E: shape"),
         ("[disturbance]", '[disturbance]\npolicy = "none"', "disturbance.policy"),
+        (
+            "u_max = [1.0]",
+            "u_max = [1.0]\ninput_rate_limit = 0.3\n[sweep]\nfixed = [1.0, 1.0, 1.0]",
+            r"sweep.fixed: has 3.*3 states \(1 of them previous inputs, whose rates are limited\)",
+        ),
         ('terminal = "invariant"', 'terminal = "ellipsoid"', "mpc.terminal: is an Ellipsoid"),
     ],
 )

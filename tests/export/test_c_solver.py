@@ -258,7 +258,7 @@ def test_an_offset_free_loop(tmp_path):
 
 
 @pytest.mark.slow
-def test_chosen_steps_solve_most_plans():
+def test_chosen_steps_solve_most_plans(capsys):
     """On closed loops other than those of the search; a penalty for each kind of row."""
     mpc = CHECKED
     box = [-1.0, -1.0], [1.0, 1.0]
@@ -266,8 +266,11 @@ def test_chosen_steps_solve_most_plans():
     found = check_fixed_steps(mpc, solver, *box, 400, seed=7)
     assert found.solvable > 300 and found.reached >= 0.985 * found.solvable
     assert len(set(np.asarray(solver.rho).tolist())) <= len(jm.Controller(mpc).condensed.layout)
-    few = choose_steps(mpc, *box, iterations=25, plans=400)
+    assert capsys.readouterr().err == ""
+    few = choose_steps(mpc, *box, iterations=25, plans=400, progress=True)
     assert few.iterations == 25
+    begun, solved = capsys.readouterr().err.splitlines()
+    assert begun.endswith(" s  25 iterations") and "25 iterations solve " in solved
     given = check_fixed_steps(mpc, jm.ADMM(iterations=25), *box, 400, seed=7)
     assert check_fixed_steps(mpc, few, *box, 400, seed=7).reached >= given.reached
 

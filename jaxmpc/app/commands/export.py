@@ -52,6 +52,7 @@ class Export(ExportOptions):
                 iterations=self.iterations,
                 plans=self.plans,
                 tolerance=tolerance,
+                progress=True,
             )
         if self.law == "explicit":
             print("searching regions", file=sys.stderr)

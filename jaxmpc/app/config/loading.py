@@ -296,17 +296,20 @@ def _check_sweep(config: Config, n: int) -> None:
     axes = mapped_axes(config)
     d = len(axes)
     states = len([i for i in range(len(config.system.A)) if i not in axes])
+    all_states, previous = f"{n} states", n - len(config.system.A)
+    if previous:
+        all_states += f" ({previous} of them previous inputs, whose rates are limited)"
     for key, count in (("grid", d), ("lower", d), ("upper", d), ("fixed", n - d)):
         value = getattr(sweep, key)
         if value is not None and len(value) != count and (key != "fixed" or len(value) != states):
-            cure = f"{n} states, of which {d} are mapped (sweep.axes)"
+            cure = f"{all_states}, of which {d} are mapped (sweep.axes)"
             fail(f"sweep.{key}", f"has {len(value)} entries where {count} are needed", cure)
     _check_order("sweep", sweep, "lower", "upper")
     both = sweep.fixed is not None and sweep.projection
     if both or (states and sweep.fixed is None and not sweep.projection):
         cure = f"Give the {n - d} other values in sweep.fixed (a slice) or projection = true"
         what = "fixed and projection exclude each other"
-        fail("sweep.fixed", what if both else f"{n} states, {d} mapped", cure)
+        fail("sweep.fixed", what if both else f"{all_states}, {d} mapped", cure)
     if d == n and sweep.projection:
         fail("sweep.projection", f"true, and all {n} states are mapped", "Name fewer in sweep.axes")
     section_ends(config, mapped_axes(config), sweep)

@@ -154,7 +154,7 @@ class DisturbanceSection:
 
     w_min: Vector  # (p,), at most 0
     w_max: Vector  # (p,), at least 0
-    E: Matrix | None = None  # (n, p), none means the identity
+    E: Matrix | None = None  # (n, p) of a time step, none means the identity
     # How later inputs answer to w: by a gain, in a tube, or by any affine function; maps that are
     # stored, and exported controllers, take the first alone.
     policy: Literal["tightened", "affine", "tube"] = "tightened"

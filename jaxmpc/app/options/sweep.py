@@ -89,9 +89,10 @@ class SweepOptions:
       [[outputs]]  optional, repeated: lower <= C x + D u <= upper; stages, names, units; soft
                 with rho, its L1 weight, and quadratic
       [reference]  optional: state and input that closed loops track (jaxmpc tune weights)
-      [disturbance]  optional: w_min, w_max; E of x+ = A x + B u + E w; policy = "tightened" |
-                "affine" | "tube"; gain of u = v + gain (x - z), not of "affine": feasible means
-                that a policy of this kind keeps all limits for every such w
+      [disturbance]  optional: w_min, w_max; E of x+ = A x + B u + E w, of a time step also
+                with continuous = true; policy = "tightened" | "affine" | "tube"; gain of
+                u = v + gain (x - z), not of "affine": feasible means that a policy of this kind
+                keeps all limits for every such w
       and what jaxmpc tune writes, see its help: [limits] margin, [mpc] H_f, h_f or P_f, level_f,
       [solver]
       [sweep]   all optional: grid, lower, upper, axes, fixed, projection, iterations, dtype
