@@ -36,6 +36,23 @@ def test_each_instance_takes_its_own_number_of_steps(count):
     np.testing.assert_array_equal(found, [collatz(int(n)) for n in starts])
 
 
+@pytest.mark.parametrize("sizes", [[20, 5, 2], [5, 2], [3]])
+def test_groups_that_are_filled_up(sizes, monkeypatch):
+    """Groups of several sizes, the first of them the batch or not; the last instance, with copies
+    of which groups are filled up, stays the longest."""
+    starts = np.array([1, 2, 3] * 6 + [1, 27], np.int32)
+    assert len(starts) == 20 and collatz(27) > 100
+    monkeypatch.setattr(jax_transformations, "group_sizes", lambda *_: sizes)
+    found = jax.jit(jax.vmap(counted, in_axes=(None, 0)))(jnp.int32(3), starts)
+    np.testing.assert_array_equal(found, [collatz(int(n)) for n in starts])
+
+
+def test_a_recursion_has_three_groups_on_a_gpu(monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert group_sizes(4096, "recursion") == [4096, 1024, 128]
+    assert group_sizes(1024, "recursion") == [1024]
+
+
 @pytest.mark.parametrize("shared", [True, False])
 @pytest.mark.parametrize("count", [1, 5, 300])
 def test_a_first_step_that_leaves_some_as_they_are(count, shared):

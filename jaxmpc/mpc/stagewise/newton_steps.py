@@ -40,10 +40,18 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxmpc.mpc.stagewise.stages import Stages, conditions, measured_pair, minimise, riccati
+from jaxmpc.mpc.stagewise.stages import (
+    Stages,
+    conditions,
+    measured_pair,
+    minimise,
+    residuals_of,
+    riccati,
+)
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.admm import scaled_multipliers
 from jaxmpc.qp.jax_transformations import Undo
+from jaxmpc.qp.linalg import rounding
 from jaxmpc.qp.newton import Constants
 from jaxmpc.qp.problem import Bounds
 from jaxmpc.qp.residuals import Pair
@@ -53,6 +61,8 @@ INTERIOR_STEPS = 40
 # Slack of the first step at least, in scaled rows; part of the way to the boundary that is taken;
 # and the part of a step below which the iterates have come to rest.
 LEAST_SLACK, FRACTION, REST = 1e-2, 0.995, 1e-8
+# Where rounding stops the method: the residuals, once below BEGUN, grow LOST times.
+BEGUN, LOST = 1e-3, 100.0
 # Of a proximal term on the multipliers: weights of 1e11 and more would be lost in rounding.
 DAMPING = 1e-11
 
@@ -194,8 +204,8 @@ class Limits(NamedTuple):
 @pytree
 class SearchState:
     """Loop state of one instance: inputs u (N, m), multipliers y (rows,) or, of the interior point
-    method, the sides' numbers, the best pair of all so far, the steps taken, and whether to go on.
-    """
+    method, the sides' numbers, the rows and the gradient (N, m) of the Lagrangian, the best pair of
+    all so far, the steps taken, and whether to go on."""
 
     u: Array
     dual: Any
@@ -229,10 +239,10 @@ def interior_step(most: int, constants: tuple, state: SearchState) -> SearchStat
     that no input moves, 0 in others, and eps.
     """
     s, E, fixed, eps = constants
-    limits, at, first = Limits.of(s.bounds.scaled(E)), state.dual, state.steps == 0
-    found = conditions(s, state.u, fixed + E * limits.multipliers(at))
+    limits, (at, rows, gradient) = Limits.of(s.bounds.scaled(E)), state.dual
+    first = state.steps == 0
     nu, has = limits.nu(at), limits.present
-    v = E * found.rows
+    v = E * rows
     r = limits.sign * (v - limits.b) - at.e + at.t
     bend = jnp.where(limits.soft & ~first, nu + limits.k * at.e, 1.0)
     loose = jnp.where(has & ~first, at.t + at.z * (at.e / bend + DAMPING), 1.0)
@@ -245,7 +255,7 @@ def interior_step(most: int, constants: tuple, state: SearchState) -> SearchStat
         give = jnp.where(limits.soft, (targets[1] - at.e * nu) / bend, 0.0)
         beta = jnp.where(has, (far + at.z * (r - give)) / loose, 0.0)
         gx, gu = s.pull(E * jnp.sum(limits.sign * beta, axis=0))
-        dx, du = minimise(s, gains, -gx, -gu - found.gradient)
+        dx, du = minimise(s, gains, -gx, -gu - gradient)
         dv = E * s.rows(dx, du)
         dz = omega * limits.sign * dv + beta
         de = give + at.e * dz / bend
@@ -264,12 +274,14 @@ def interior_step(most: int, constants: tuple, state: SearchState) -> SearchStat
     u = state.u + length * clean(du)
     begun, at = limits.start(v + dv), at.moved(clean(step), length)
     at = jax.tree.map(lambda a, b: jnp.where(first, a, b), begun, at)
-    y = fixed + E * limits.multipliers(at)
-    pair = measured_pair(eps, s, u, y)
+    y = s.bounds.admissible(fixed + E * limits.multipliers(at))
+    found = conditions(s, u, y)
+    pair = Pair.of(u, y, residuals_of(s, u, y, found), eps, rounding(u.dtype))
     again = pair.measured.within_tolerance & state.best.measured.within_tolerance
     best, steps = state.best.or_better(pair), state.steps + 1
-    wanted = ~(best.near | best.finished | again) & sound & (steps < most)
-    return SearchState(u, at, best, steps, wanted)
+    lost = (best.error < BEGUN) & (pair.error > LOST * best.error)
+    wanted = ~(best.near | best.finished | again | lost) & sound & (steps < most)
+    return SearchState(u, (at, found.rows, found.gradient), best, steps, wanted)
 
 
 class Search(NamedTuple):
@@ -290,7 +302,9 @@ class Search(NamedTuple):
         if not self.interior:
             return best
         blank = jnp.zeros((2, len(best.y)), best.y.dtype)
-        begun = SearchState.begin(best, Sides(blank, blank, blank))
+        found = conditions(s, best.z, fixed)
+        dual = Sides(blank, blank, blank), found.rows, found.gradient
+        begun = SearchState.begin(best, dual)
         begun = replace(begun, open=begun.open & wanted)
         step = partial(interior_step, self.interior)
         return self.loop(step, self.interior, (s, E, fixed, eps), begun).best

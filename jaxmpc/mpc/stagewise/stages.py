@@ -250,14 +250,22 @@ def riccati(s: Stages, weights: Any = None) -> Gains:
     for block, w in () if weights is None else s.by_block(weights):
         H, D, steps, box = block.H, block.D, block.steps, block.box
         diagonal = lambda w: w[:, :, None] * jnp.eye(w.shape[1], dtype=w.dtype)
-        form = lambda M, L, w=w: matmul(jnp.swapaxes(M, -1, -2) * w[:, None, :], L)
         if H is not None:
-            Q = Q + spread(diagonal(w) if box else form(H, H), steps, N + 1)
+            Q = Q + spread(diagonal(w) if box else _weighed(H, H, w), steps, N + 1)
         if D is not None:
-            R = R + spread(diagonal(w) if box else form(D, D), steps, N)
+            R = R + spread(diagonal(w) if box else _weighed(D, D, w), steps, N)
         if H is not None and D is not None:
-            cross = (0.0 if cross is None else cross) + spread(form(D, H), steps, N)
+            cross = (0.0 if cross is None else cross) + spread(_weighed(D, H, w), steps, N)
     return riccati_recursion(Q, R, cross, s.A, s.B)
+
+
+def _weighed(M: Array, L: Array, w: Array) -> Array:
+    """Return M'diag(w_k)L of each step (steps, a, b); w (steps, r), M (r, a) and L (r, b), or one a
+    step."""
+    if M.ndim == 2 and L.ndim == 2:  # the same at all steps, of a batch too: one product with w
+        products = M[:, :, None] * L[:, None, :]
+        return matmul(w, products.reshape(len(M), -1)).reshape(-1, *products.shape[1:])
+    return matmul(jnp.swapaxes(M, -1, -2) * w[:, None, :], L)
 
 
 def minimise(s: Stages, gains: Gains, gx: Array, gu: Array, unroll: int = 1) -> tuple[Array, Array]:
@@ -300,9 +308,10 @@ def conditions(s: Stages, u: Array, y: Array) -> Optimality:
     leads to and the costates λ_k = ∂J/∂x_k + H'y + A'λ_{k+1}."""
     x = predict(s, u)
     (gx, own), (px, pushed) = s.gradient(x, u), s.pull(y)
-    back = lambda g: recurrence(s.A, g[:-1], g[-1], adjoint=True)
     # Of cost and rows apart: at the solution their sum is small, its rounding is that of the parts.
-    of_cost, of_rows = (jnp.concatenate([back(g)[1:], g[-1:]]) for g in (gx, px))
+    both = jnp.stack([gx, px])
+    back = jax.vmap(lambda g: recurrence(s.A, g[:-1], g[-1], adjoint=True))(both)
+    of_cost, of_rows = jnp.concatenate([back[:, 1:], both[:, -1:]], axis=1)
     absolute = jax.tree.map(jnp.abs, replace(s, bounds=Bounds(s.bounds.l, s.bounds.u)))
     # A state is a difference of the terms of its step, as where torques balance the weight.
     moved = apply(absolute.A, jnp.abs(x[:-1])) + apply(absolute.B, jnp.abs(u)) + absolute.c
@@ -328,13 +337,18 @@ def conditions(s: Stages, u: Array, y: Array) -> Optimality:
 
 
 def stage_residuals(s: Stages, u: Array, y: Array) -> Terms:
-    """As `qp.residuals.residual_terms`, for the condensed QP in the inputs.
+    """As `qp.residuals.residual_terms`, for the condensed QP in the inputs."""
+    return residuals_of(s, u, y, conditions(s, u, y))
+
+
+def residuals_of(s: Stages, u: Array, y: Array, found: Optimality) -> Terms:
+    """Return `stage_residuals` of a pair whose conditions are known.
 
     With the gradient g of the Lagrangian the gap z'Pz + q'z + g(Az) + g*(y) is
     u'g + g(rows) + g*(y) − y'rows: at the optimum both parts are zero. What is typical of a row
     and of an input is what is the most of the same one over the horizon.
     """
-    found, bounds = conditions(s, u, y), s.bounds
+    bounds = s.bounds
     penalty, support, product = bounds.cost(found.rows), bounds.support(y), y * found.rows
     gap = jnp.sum(u * found.gradient) + jnp.sum(penalty + support - product)
     terms = jnp.sum(jnp.abs(u) * found.gradient_terms)
