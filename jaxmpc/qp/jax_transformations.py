@@ -55,8 +55,8 @@ LONG_PART_CPU, LONG_FEW_CPU, RECURSION_CPU = 64, 8, 16
 # Instances in a group elsewhere: a quarter of the batch; when fewer are open a sixteenth of that,
 # and so on, but not below LEAST, where a step costs little more than its launches. (H100,
 # TurboMPC's problem, 4,096 at once: 2.6 µs a solve in one group, 1.6 in groups of 512, 1.2 of 1,024
-# and 256.) Of recursions over a horizon the whole batch, a quarter and an eighth of that: 4,096 arms
-# for 1 s took 1.31 s in groups of 4,096 and 256, 1.21 with 1,024 and 128.
+# and 256.) Of recursions over a horizon the whole batch, a quarter, and an eighth of that. (4,096
+# arms for 1 s: 1.31 s in groups of 4,096 and 256, 1.21 of 4,096, 1,024 and 128.)
 PART, SMALLER, LEAST = 4, 16, 256
 # Operations of a group's step there that take as long as its launches, where a step says how many
 # it has an instance: of those with many, smaller groups are worth it, of FEWEST at least.
