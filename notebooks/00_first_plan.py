@@ -8,7 +8,7 @@
 # ---
 
 # %% [markdown]
-# # A first plan
+# # 0. A first plan
 #
 # You will describe a robot joint with its limits, compute one optimal plan with model predictive
 # control (MPC), read its status, and run the controller in a closed loop. At the end you know why
@@ -44,8 +44,9 @@ system = jm.LinearSystem(
     state_units=("rad", "rad/s"),
     input_units=("N m",),
 )
-limits = jm.Box([-1.5, -2.0], [1.5, 2.0])  # |q| <= 1.5 rad, |dq| <= 2 rad/s
-torque = jm.Box([-2.0], [2.0])  # |u| <= 2 N m
+q_max, dq_max, u_max = 1.5, 2.0, 2.0  # rad, rad/s, N m
+limits = jm.Box([-q_max, -dq_max], [q_max, dq_max])
+torque = jm.Box([-u_max], [u_max])
 
 # %% [markdown]
 # ## The optimal control problem
@@ -71,7 +72,7 @@ controller = jm.Controller(mpc)
 x0 = np.array([-1.2, 0.1])
 plan = controller.plan(x0)
 print(plan.sentence)
-assert int(plan.status) == jm.Status.SOLVED
+assert int(plan.status) == jm.Status.SOLVED, "The joint has a plan from here."
 
 # %% [markdown]
 # The plan has `states` of shape $(N + 1, 2)$ and `inputs` of shape $(N, 1)$. Always look at the
@@ -87,9 +88,9 @@ def draw(states, inputs, title):
     time = T * np.arange(len(states))
     figure, axes = plt.subplots(3, 1, figsize=(6, 4.8), sharex=True, layout="constrained")
     curves = (
-        ("q [rad]", states[:, 0], 1.5),
-        ("dq [rad/s]", states[:, 1], 2.0),
-        ("torque [N m]", inputs[:, 0], 2.0),
+        ("q [rad]", states[:, 0], q_max),
+        ("dq [rad/s]", states[:, 1], dq_max),
+        ("torque [N m]", inputs[:, 0], u_max),
     )
     for axis, (label, values, limit) in zip(axes, curves, strict=True):
         for sign in (-1, 1):
@@ -105,7 +106,7 @@ def draw(states, inputs, title):
     plt.show()
 
 
-draw(plan.states, plan.inputs, "One plan of 20 steps from q = −1.2 rad")
+draw(plan.states, plan.inputs, f"One plan of {N} steps from q = {x0[0]:g} rad")
 
 # %% [markdown]
 # The plan accelerates with full torque until the velocity reaches its limit of 2 rad/s, and then
@@ -114,12 +115,14 @@ draw(plan.states, plan.inputs, "One plan of 20 steps from q = −1.2 rad")
 
 # %%
 velocity, applied = np.asarray(plan.states)[:, 1], np.asarray(plan.inputs)[:, 0]
-at_torque_limit = np.abs(applied - 2.0) < 1e-4
-at_velocity_limit = np.abs(velocity - 2.0) < 1e-4
+at_torque_limit = np.abs(applied - u_max) < 1e-4
+at_velocity_limit = np.abs(velocity - dq_max) < 1e-4
 print("steps at the torque limit:  ", np.flatnonzero(at_torque_limit))
 print("steps at the velocity limit:", np.flatnonzero(at_velocity_limit))
-assert np.flatnonzero(at_torque_limit).tolist() == [0, 1, 2, 3]
-assert np.abs(np.asarray(plan.states)[:, 0]).max() <= 1.5
+full = np.flatnonzero(at_torque_limit).tolist()
+assert full == [0, 1, 2, 3], "The plan accelerates with full torque for four steps."
+assert at_velocity_limit.any(), "The velocity reaches its limit."
+assert np.abs(np.asarray(plan.states)[:, 0]).max() <= q_max, "The angle keeps its limit."
 
 # %% [markdown]
 # ## Closed loop
@@ -130,23 +133,24 @@ assert np.abs(np.asarray(plan.states)[:, 0]).max() <= 1.5
 # to the reference $q = 1$ rad; the reference enters the cost, the constraints stay where they are.
 
 # %%
-x = np.zeros(2)
+x, goal = np.zeros(2), 1.0
 control = controller.start(x)
 states, inputs = [x], []
 for _ in range(120):
-    control = controller(x, control, reference=np.array([1.0, 0.0]))
-    assert control.plan.solved
+    control = controller(x, control, reference=np.array([goal, 0.0]))
+    assert control.plan.solved, "Every plan is solved."
     x = np.asarray(system.A) @ x + np.asarray(system.B) @ np.asarray(control.u)
     states.append(x)
     inputs.append(np.asarray(control.u))
 states, inputs = np.array(states), np.array(inputs)
-draw(states, inputs, "Closed loop from rest to the reference 1 rad")
+draw(states, inputs, f"Closed loop from rest to the reference {goal:g} rad")
 
 # %%
 final = states[-1]
 print(f"after {T * len(inputs):.1f} s: q = {final[0]:.4f} rad, dq = {final[1]:.4f} rad/s")
-assert np.all(np.abs(states) <= np.array([1.5, 2.0]) + 1e-5) and np.all(np.abs(inputs) <= 2)
-assert abs(final[0] - 1) < 0.01
+assert np.all(np.abs(states) <= np.array([q_max, dq_max]) + 1e-5), "Angle and velocity keep limits."
+assert np.all(np.abs(inputs) <= u_max), "The torque keeps its limit."
+assert abs(final[0] - goal) < 0.01, "The joint arrives at the reference."
 
 # %% [markdown]
 # ## A failure, and what it means
@@ -155,10 +159,10 @@ assert abs(final[0] - 1) < 0.01
 
 # %%
 x0 = np.array([1.49, 1.9])
-assert bool(limits.contains(x0))
+assert bool(limits.contains(x0)), "The state is within all limits."
 plan = controller.plan(x0)
 print(jm.Status(int(plan.status)).name, "-", plan.sentence)
-assert int(plan.status) == jm.Status.PRIMAL_INFEASIBLE
+assert int(plan.status) == jm.Status.PRIMAL_INFEASIBLE, "And yet there is no plan."
 
 # %% [markdown]
 # There is none, and the solver has a proof of that. The reason is the braking distance. Full
@@ -166,22 +170,25 @@ assert int(plan.status) == jm.Status.PRIMAL_INFEASIBLE
 # the velocities 1.9, 1.5, 1.1, 0.7 and 0.3 rad/s still pass before the joint stands:
 
 # %%
-per_step = T * 2.0 / J
-velocities = np.arange(1.9, 0, -per_step)
+per_step, fast = T * u_max / J, x0[1]
+velocities = np.arange(fast, 0, -per_step)
 distance = T * velocities.sum()
+edge = q_max - distance
 print("velocities while braking:", velocities, "rad/s")
-print(f"braking distance: {distance:.3f} rad, so q <= {1.5 - distance:.3f} rad at 1.9 rad/s")
-assert np.isclose(per_step, 0.4) and np.isclose(distance, 0.055)
+print(f"braking distance: {distance:.3f} rad, so q <= {edge:.3f} rad at {fast:g} rad/s")
+assert np.isclose(per_step, 0.4), "Full torque changes the velocity by 0.4 rad/s in each step."
+assert np.isclose(distance, 0.055), "The joint moves on by 0.055 rad."
 
 # %% [markdown]
 # The joint moves on by 0.055 rad at least, so with 1.9 rad/s it must not be beyond 1.445 rad. The
 # solver knows nothing about braking distances, yet it finds the same boundary:
 
 # %%
-for q in (1.444, 1.446):
-    status = jm.Status(int(controller.plan(np.array([q, 1.9])).status))
-    print(f"q = {q} rad: {status.name}")
-    assert status == (jm.Status.SOLVED if q < 1.445 else jm.Status.PRIMAL_INFEASIBLE)
+for q in (edge - 1e-3, edge + 1e-3):
+    status = jm.Status(int(controller.plan(np.array([q, fast])).status))
+    print(f"q = {q:.3f} rad: {status.name}")
+    expected = jm.Status.SOLVED if q < edge else jm.Status.PRIMAL_INFEASIBLE
+    assert status == expected, "The solver finds the boundary that the braking distance gives."
 
 # %% [markdown]
 # So a limit on the state is not the same as the set of states from which limits can be kept. This
@@ -205,9 +212,10 @@ for q in (1.444, 1.446):
 # it never coasts all the way.
 
 # %%
-count = int(np.sum(np.abs(states[:, 1] - 2.0) < 1e-4))
-print(f"{count} samples, {T * count:.2f} s, at the velocity limit; 1 rad at 2 rad/s takes 0.5 s")
-assert 0 < T * count < 0.5
+count = int(np.sum(np.abs(states[:, 1] - dq_max) < 1e-4))
+whole = goal / dq_max
+print(f"{count} samples, {T * count:.2f} s, at the velocity limit; {whole:g} s for all of the way")
+assert 0 < T * count < whole, "The joint never coasts all the way."
 
 # %% [markdown]
 # **2.** A plan with expensive torque accelerates less.
@@ -215,22 +223,22 @@ assert 0 < T * count < 0.5
 # %%
 x0 = np.array([-1.2, 0.1])
 cheap = controller.plan(x0)
-expensive = jm.MPC(
-    system, Q, np.array([[10.0]]), horizon=N, states=limits, inputs=torque, terminal_cost=Q
-)
+dear = np.array([[10.0]])
+expensive = jm.MPC(system, Q, dear, horizon=N, states=limits, inputs=torque, terminal_cost=Q)
 costly = jm.solve(expensive, x0)
 largest = [float(np.abs(np.asarray(p.inputs)).max()) for p in (cheap, costly)]
-print(f"largest torque: {largest[0]:.3f} N m for R = 0.1, {largest[1]:.3f} N m for R = 10")
-assert largest[1] < largest[0]
+for weight, value in zip((R, dear), largest, strict=True):
+    print(f"largest torque for R = {weight.item():g}: {value:.3f} N m")
+assert largest[1] < largest[0], "A plan with expensive torque accelerates less."
 
 # %% [markdown]
 # **3.** The rows of $G_x$ are $\pm$ the unit vectors: each limit of a box is one row.
 
 # %%
 G = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
-g = np.array([1.5, 1.5, 2.0, 2.0])
+g = np.array([q_max, q_max, dq_max, dq_max])
 rows = jm.Polytope(G, g)
 samples = np.random.default_rng(0).uniform([-2.0, -3.0], [2.0, 3.0], (200, 2))
 for sample in samples:
-    assert bool(rows.contains(sample)) == bool(limits.contains(sample))
+    assert bool(rows.contains(sample)) == bool(limits.contains(sample)), "Both are the same set."
 print("the polytope and the box agree on", len(samples), "random states")

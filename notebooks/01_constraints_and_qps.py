@@ -8,7 +8,7 @@
 # ---
 
 # %% [markdown]
-# # Constraints and quadratic programs
+# # 1. Constraints and quadratic programs
 #
 # You will turn a small MPC problem into a quadratic program (QP) by hand, solve it, and check with
 # three residuals that the answer is right. You will read the active constraints from the Lagrange
@@ -70,7 +70,7 @@ solution = jm.solve_qp(qp)
 z = np.asarray(solution.z)
 print(solution.sentence)
 print("torques:", z, "N m")
-assert int(solution.status) == jm.Status.SOLVED
+assert int(solution.status) == jm.Status.SOLVED, "The program is solved."
 
 # %% [markdown]
 # `jm.solve` does the same from the MPC problem. The inputs and the cost agree; the constant
@@ -90,8 +90,9 @@ mpc = jm.MPC(
 )
 plan = jm.solve(mpc, x0)
 constant = sum(x0 @ F.T @ W @ F @ x0 for F, W in zip(Phi, weights, strict=True))
-assert np.allclose(np.asarray(plan.inputs)[:, 0], z, atol=1e-7)
-assert np.isclose(float(plan.cost), float(solution.cost) + constant, rtol=1e-9)
+assert np.allclose(np.asarray(plan.inputs)[:, 0], z, atol=1e-7), "The inputs agree."
+total = float(solution.cost) + constant
+assert np.isclose(float(plan.cost), total, rtol=1e-9), "The costs agree, but for the constant."
 print(f"cost {float(plan.cost):.6f} = {float(solution.cost):.6f} + {constant:.6f}")
 
 # %% [markdown]
@@ -146,7 +147,7 @@ ours = residuals(qp, z, np.asarray(solution.y))
 theirs = [float(r) for r in (solution.primal_residual, solution.dual_residual, solution.gap)]
 for name, mine, stated in zip(("primal", "dual", "gap"), ours, theirs, strict=True):
     print(f"{name:7} computed here {mine:.1e}, stated by the solver {stated:.1e}")
-assert max(ours) < 1e-6 and max(theirs) < 1e-6
+assert max(ours) < 1e-6 and max(theirs) < 1e-6, "All three are within tolerance, ours and theirs."
 
 # %% [markdown]
 # The status `SOLVED` says that these three residuals are within tolerance ($10^{-6}$ in float64).
@@ -163,17 +164,21 @@ assert max(ours) < 1e-6 and max(theirs) < 1e-6
 active = jm.mpc.active_constraints(mpc, plan)
 for constraint in active:
     print(constraint)
-assert len(active) == 1 and active[0].name.startswith("dq") and active[0].stage == 1
+found = [(constraint.name.split()[0], constraint.stage) for constraint in active]
+assert found == [("dq", 1)], "One constraint is active: the velocity limit at k = 1."
 
 # %%
-row = 3  # the velocity in x_1: rows 0, 1 are torques, 2, 3 are x_1, 4, 5 are x_2
-delta = 1e-4
-relaxed = jm.QP(qp.P, qp.q, qp.A, qp.l, qp.u + delta * np.eye(6)[row])
+rows = ["u_0", "u_1", "q in x_1", "dq in x_1", "q in x_2", "dq in x_2"]  # of C
+row = int(np.argmax(np.abs(solution.y)))  # the one that pushes most
+price, delta = abs(float(solution.y[row])), 1e-4
+side = delta * np.eye(len(rows))[row]  # a multiplier below zero belongs to the lower bound
+upper, lower = (side, 0 * side) if solution.y[row] > 0 else (0 * side, side)
+relaxed = jm.QP(qp.P, qp.q, qp.A, qp.l - lower, qp.u + upper)
 cheaper = float(solution.cost) - float(jm.solve_qp(relaxed).cost)
-price = float(solution.y[row])
-print(f"cost falls by {cheaper / delta:.5f} per rad/s; the multiplier is {price:.5f}")
-assert np.isclose(cheaper / delta, price, rtol=1e-3)
-assert np.isclose(active[0].multiplier, price, rtol=1e-6)
+print(f"row of {rows[row]}: the cost falls by {cheaper / delta:.5f} a unit")
+print(f"its multiplier is {price:.5f}")
+assert np.isclose(cheaper / delta, price, rtol=1e-3), "The multiplier is the price of the bound."
+assert np.isclose(abs(active[0].multiplier), price, rtol=1e-6), "The plan has the same multiplier."
 
 # %% [markdown]
 # ## A failure, and its proof
@@ -188,7 +193,7 @@ slope = 2 * sum(G.T @ W @ F @ too_fast for F, G, W in zip(Phi, Gamma, weights, s
 impossible = jm.QP(P_z, slope, C, l=-bound - free, u=bound - free)
 answer = jm.solve_qp(impossible)
 print(answer.sentence)
-assert int(answer.status) == jm.Status.PRIMAL_INFEASIBLE
+assert int(answer.status) == jm.Status.PRIMAL_INFEASIBLE, "Two steps cannot bring it back."
 
 # %% [markdown]
 # "No solution found" would be a weak answer: perhaps the solver was not patient enough. The
@@ -206,7 +211,8 @@ y = np.asarray(answer.certificate)
 value = impossible.u @ np.maximum(y, 0) - impossible.l @ np.maximum(-y, 0)
 print("certificate:", np.round(y / np.abs(y).max(), 3))
 print(f"largest entry of C'y: {np.abs(C.T @ y).max():.1e};  u'y+ - l'y-: {value:.4f}")
-assert np.abs(C.T @ y).max() < 1e-12 * np.abs(y).max() and value < 0
+assert np.abs(C.T @ y).max() < 1e-12 * np.abs(y).max(), "C'y is zero."
+assert value < 0, "u'y+ - l'y- is negative: this is a certificate."
 
 # %% [markdown]
 # The certificate also explains the conflict. Multiply the row of the velocity $\dot q_1$ by 1 and
@@ -218,9 +224,12 @@ assert np.abs(C.T @ y).max() < 1e-12 * np.abs(y).max() and value < 0
 by_hand = np.zeros(6)
 by_hand[0], by_hand[3] = -T / J, 1.0
 value = impossible.u @ np.maximum(by_hand, 0) - impossible.l @ np.maximum(-by_hand, 0)
-assert np.allclose(C.T @ by_hand, 0)
-assert np.isclose(value, 2.4 - 2.9)
-print(f"certificate by hand: u'y+ - l'y- = {value:.2f} rad/s = 2.4 - 2.9")
+dq_max = x_max[1]
+most = dq_max + T / J * u_max  # from which one step of full torque brakes to the limit
+print(f"certificate by hand: u'y+ - l'y- = {value:.2f} rad/s = {most:g} - {too_fast[1]:g}")
+assert np.allclose(C.T @ by_hand, 0), "The variables cancel."
+assert np.isclose(value, most - too_fast[1]), "What is left is the bound of dq_0."
+assert np.isclose(most, 2.4), "The velocity limit can be kept from 2.4 rad/s at most."
 
 # %% [markdown]
 # ## Exercises
@@ -245,18 +254,20 @@ stationarity = np.abs(P_z @ z + q + C.T @ (above - below)).max()
 primal = max(np.max(rows - qp.u), np.max(qp.l - rows), 0.0)
 slackness = max(np.abs(above * (qp.u - rows)).max(), np.abs(below * (rows - qp.l)).max())
 print(f"stationarity {stationarity:.1e}, primal {primal:.1e}, slackness {slackness:.1e}")
-assert max(stationarity, primal, slackness) < 1e-6 and above.min() >= 0 and below.min() >= 0
+assert max(stationarity, primal, slackness) < 1e-6, "Three of the conditions hold, to 1e-6."
+assert above.min() >= 0 and below.min() >= 0, "And no multiplier is negative."
 
 # %% [markdown]
 # **2.** The margin is negative: every bound must give way by its absolute value. By hand: widen
 # torque and velocity by $t$, then $2.9 - 0.2\,(2 + t) \le 2 + t$, so that
-# $t = 0.5 / 1.2$.
+# $t = 0.5 / 1.2$. (The limits at $k = 1$ decide; those at $k = 2$ can do so for other numbers.)
 
 # %%
 margin, status = jm.qp.feasibility_margin(impossible)
-assert int(status) == jm.Status.SOLVED
-print(f"margin {float(margin):.6f}; by hand {-0.5 / 1.2:.6f}")
-assert np.isclose(float(margin), -0.5 / 1.2, atol=1e-6)
+assert int(status) == jm.Status.SOLVED, "The margin is found."
+first = (most - too_fast[1]) / (1 + T / J)
+print(f"margin {float(margin):.6f}; by hand {first:.6f}")
+assert np.isclose(float(margin), first, atol=1e-6), "The limits at k = 1 decide."
 
 # %% [markdown]
 # **3.** The certificate uses $x_0$ only through the bounds, which are affine in $x_0$. It proves
@@ -274,5 +285,6 @@ def excluded(x):
 
 
 for q0 in (-1.0, 0.0, 1.2):
-    assert excluded(np.array([q0, 2.401])) and not excluded(np.array([q0, 2.399]))
-print("excluded: all states with dq > 2.4 rad/s")
+    fast, slow = (np.array([q0, most + d]) for d in (1e-3, -1e-3))
+    assert excluded(fast) and not excluded(slow), "It excludes what is faster, whatever q is."
+print(f"excluded: all states with dq > {most:g} rad/s")

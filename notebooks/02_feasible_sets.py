@@ -8,7 +8,7 @@
 # ---
 
 # %% [markdown]
-# # Feasible sets
+# # 2. Feasible sets
 #
 # From which initial states can an MPC controller keep all its limits? You will map this set for
 # the robot joint, enclose its area between two bounds that meet at 1489/125, and check two of the
@@ -49,15 +49,16 @@ system = jm.LinearSystem(
     input_names=("torque",),
     input_units=("N m",),
 )
-limits, torque = jm.Box([-1.5, -2.0], [1.5, 2.0]), jm.Box([-2.0], [2.0])
+q_max, dq_max, u_max, N = 1.5, 2.0, 2.0, 20
+limits, torque = jm.Box([-q_max, -dq_max], [q_max, dq_max]), jm.Box([-u_max], [u_max])
 Q, R = np.diag([50.0, 1.0]), np.array([[0.1]])
-mpc = jm.MPC(system, Q, R, horizon=20, states=limits, inputs=torque, terminal_cost=Q)
+mpc = jm.MPC(system, Q, R, horizon=N, states=limits, inputs=torque, terminal_cost=Q)
 
 shape = (64, 64)
-x0s = jm.grid([-1.6, -2.1], [1.6, 2.1], shape)
+x0s = jm.grid([-1.07 * q_max, -1.05 * dq_max], [1.07 * q_max, 1.05 * dq_max], shape)
 fmap = jm.map_feasible_set(mpc, x0s)
 print(fmap.counts())
-assert fmap.counts()["undecided"] == 0
+assert fmap.counts()["undecided"] == 0, "Every state has a label."
 
 # %% [markdown]
 # Every state has one of three labels: 1, proved feasible; −1, proved infeasible; 0, undecided.
@@ -69,7 +70,7 @@ assert fmap.counts()["undecided"] == 0
 # %%
 low, high = fmap.volume_bounds()
 print(f"area between {low:.3f} and {high:.3f} rad·rad/s")
-assert low < 1489 / 125 < high
+assert low < 1489 / 125 < high, "The bounds enclose 1489/125."
 
 # %% [markdown]
 # `refine()` closes the gap. It sends rays through the vertices of the outer polygon; each ray ends
@@ -78,8 +79,9 @@ assert low < 1489 / 125 < high
 # %%
 fmap = fmap.refine()
 low, high = fmap.volume_bounds()
-print(f"area between {low:.9f} and {high:.9f} rad·rad/s; 1489/125 = {1489 / 125}")
-assert low <= 1489 / 125 <= high and (high - low) / high < 1e-6
+print(f"area between {low:.9f} and {high:.9f} rad·rad/s")
+assert (high - low) / high < 1e-6, "The bounds meet."
+assert low <= 1489 / 125 <= high, "They meet at 1489/125."
 
 
 # %%
@@ -89,13 +91,14 @@ def draw(label, title, outline=True):
     colors = {"infeasible": "#dddcd8", "feasible": "#9fcbe6"}
     q, dq = (np.unique(column) for column in x0s.T)
     cells = label.reshape(shape).T
-    axis.pcolormesh(q, dq, cells, cmap=ListedColormap([*colors.values()]), vmin=-1, vmax=1)
+    cmap = ListedColormap([*colors.values()])
+    axis.pcolormesh(q, dq, cells, cmap=cmap, vmin=-1, vmax=1, rasterized=True)
     for name, color in colors.items():
         axis.plot([], [], "s", color=color, label=name)
     if outline:
         corners = fmap.outer().vertices()
         corners = np.vstack([corners, corners[:1]])
-        axis.plot(*corners.T, color="#d55e00", lw=1.5, label="boundary")
+        axis.plot(*corners.T, color="#d55e00", lw=1.5, label="boundary", zorder=3)
     axis.set(xlabel="q [rad]", ylabel="dq [rad/s]", title=title)
     figure.legend(loc="outside right upper", fontsize=9)
     return axis
@@ -111,15 +114,27 @@ plt.show()
 #
 # $$q \le 1.5 - 0.01 \sum_{j \ge 0} \max(v - 0.4 j,\ 0).$$
 #
-# The area that this cuts off the box is an integral over $v$ from 0 to 2, twice. In fractions:
+# The area that this cuts off the box is an integral over $v$ from 0 to 2, twice. The integral of
+# $\max(v - 0.4 j, 0)$ is $(2 - 0.4 j)^2 / 2$ where $0.4 j < 2$. In fractions:
+
 
 # %%
-removed = Fraction(0)
-for j in range(5):  # the integral of max(v - 0.4 j, 0) from 0 to 2 is (2 - 0.4 j)^2 / 2
-    removed += Fraction(1, 100) * (2 - Fraction(2, 5) * j) ** 2 / 2
-area = 3 * 4 - 2 * removed
-print(f"exact area: {area}")
-assert area == Fraction(1489, 125)
+def exact_area(u_max):
+    """Return the area for torques up to u_max, for a horizon that is long enough to stop."""
+    period, inertia, top, speed, u = (
+        Fraction(str(number)) for number in (T, J, q_max, dq_max, u_max)
+    )
+    per_step = period * u / inertia  # by which full torque brakes in a step
+    steps = [j for j in range(N) if per_step * j < speed]
+    assert per_step * N >= speed, "Longer than N steps of braking: this formula does not hold."
+    removed = period * sum((speed - per_step * j) ** 2 / 2 for j in steps)
+    return 2 * top * 2 * speed - 2 * removed
+
+
+area = exact_area(u_max)
+print(f"exact area: {area} = {float(area):.9f}, between {low:.9f} and {high:.9f}")
+assert low <= area <= high, "The integral agrees with the bounds."
+assert area == Fraction(1489, 125), "It is 1489/125."
 
 # %% [markdown]
 # ## What a proof is
@@ -133,12 +148,13 @@ chosen = feasible[np.argmax(x0s[feasible] @ np.array([1.0, 0.5]))]  # fast, and 
 exact = np.vectorize(Fraction)
 A_exact, B_exact = exact(A), exact(B)
 x = exact(x0s[chosen])
-margin = Fraction(2)
+most_q, most_dq, most_u = exact([q_max, dq_max, u_max])
+margin = most_u
 for u in exact(fmap.labels.plan[chosen]):
-    margin = min(margin, 2 - abs(u[0]), Fraction(1.5) - abs(x[0]), 2 - abs(x[1]))
+    margin = min(margin, most_u - abs(u[0]), most_q - abs(x[0]), most_dq - abs(x[1]))
     x = A_exact @ x + B_exact @ u
 print(f"state {x0s[chosen].round(4)}: least distance to a limit {float(margin):.2e}")
-assert margin >= 0
+assert margin >= 0, "The plan keeps all limits, in exact arithmetic."
 
 # %% [markdown]
 # **Infeasible.** The proof is a half-space. It comes from a Farkas vector (notebook 01): multiply
@@ -146,22 +162,26 @@ assert margin >= 0
 # feasible state satisfies. Here is the half-space of a state that is within all limits:
 
 # %%
-infeasible = np.flatnonzero((fmap.label == -1) & np.all(np.abs(x0s) <= [1.5, 2.0], axis=1))
+within = np.all(np.abs(x0s) <= [q_max, dq_max], axis=1)
+infeasible = np.flatnonzero((fmap.label == -1) & within)
 worst = infeasible[np.argmax(x0s[infeasible] @ np.array([1.0, 0.5]))]
 a, b = fmap.labels.cut_normal[worst], fmap.labels.cut_offset[worst]
 a, b = a / np.abs(a).max(), b / np.abs(a).max()
 print(f"state {x0s[worst].round(4)} violates {a[0]:.4f} q + {a[1]:.4f} dq <= {b:.4f}")
-assert a @ x0s[worst] > b
-assert np.all(x0s[feasible] @ a <= b + 1e-9)  # it holds for every feasible state of the map
+assert a @ x0s[worst] > b, "The half-space excludes the state."
+assert np.all(x0s[feasible] @ a <= b + 1e-9), "It holds for every feasible state of the map."
 
 # %%
 axis = draw(fmap.label, "One half-space excludes many states", outline=False)
-velocity = np.linspace(0.5, 2.1, 2)
-axis.plot((b - a[1] * velocity) / a[0], velocity, color="#d55e00", lw=1.5)
-axis.plot(*x0s[worst], "o", color="#d55e00")
-axis.plot(*x0s[chosen], "o", color="#00486b")
-axis.annotate("plan", x0s[chosen], (-34, -16), textcoords="offset points", color="#00486b")
-axis.set(xlim=(1.2, 1.62), ylim=(0.5, 2.15))
+axis.figure.legends[0].remove()
+velocity = np.array([0.25, 1.05]) * dq_max
+axis.plot(
+    (b - a[1] * velocity) / a[0], velocity, "--", color="k", lw=1.5, label="half-space's edge"
+)
+axis.plot(*x0s[worst], "X", color="#d55e00", ms=8, label="state it was made for")
+axis.plot(*x0s[chosen], "o", color="#00486b", label="state of the plan above")
+axis.set(xlim=(0.8 * q_max, 1.07 * q_max), ylim=(0.25 * dq_max, 1.05 * dq_max))
+axis.figure.legend(loc="outside right upper", fontsize=9)
 plt.show()
 
 # %% [markdown]
@@ -178,7 +198,7 @@ guess = np.where(np.asarray(residual) <= 1e-3, 1, -1)
 missed = int(np.sum((guess == -1) & (fmap.label == 1)))
 wrongly = int(np.sum((guess == 1) & (fmap.label == -1)))
 print(f"feasible states called infeasible: {missed}; infeasible states called feasible: {wrongly}")
-assert missed > 0
+assert missed > 0, "Feasible states are called infeasible."
 draw(guess, "Guessed from the residual after 30 iterations")
 plt.show()
 
@@ -195,16 +215,17 @@ plt.show()
 #
 # `jaxmpc sweep` computes such a map from the command line and stores it with all proofs. `verify`
 # reads the stored file and proves every label again, by separate code and here in exact
-# arithmetic. Without a configuration file the command maps this joint.
+# arithmetic. Without a configuration file the command maps the joint of the course, whatever you
+# changed above: a file says what the problem is (`jaxmpc info` prints one).
 
 # %%
 with tempfile.TemporaryDirectory() as folder:
     command = [sys.executable, "-m", "jaxmpc", "sweep", "--grid", "24", "24", "--output", folder]
     done = subprocess.run([*command, "--overwrite"], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    assert done.returncode == 0, done.stderr  # the command's own message
     found = jm.verify.verify_map(folder, exact=True)
 print(found.labels, "verified:", found.verified, "exactly:", found.exactly)
-assert found.passed and found.verified == sum(found.labels.values()) == 24 * 24
+assert found.passed and found.verified == 24 * 24, "Every label is proved again."
 
 # %% [markdown]
 # ## Exercises
@@ -243,7 +264,7 @@ def interval(steps):
 
 
 print("limit at k = 0..4: x0 up to", round(interval((0, 1, 2, 3, 4)), 9))
-assert np.isclose(interval((0, 1, 2, 3, 4)), 1.0)
+assert np.isclose(interval((0, 1, 2, 3, 4)), 1.0), "x0 itself has to keep its limit."
 
 # %% [markdown]
 # **2.** It is right if the limit holds at $k = N$ alone. With $k = 1, \dots, N$ there is one step
@@ -252,16 +273,18 @@ assert np.isclose(interval((0, 1, 2, 3, 4)), 1.0)
 # %%
 print("limit at k = 4 alone:", round(interval((4,)), 9))
 print("limit at k = 1..4:   ", round(interval((1, 2, 3, 4)), 9))
-assert np.isclose(interval((4,)), 1 + 4 * 0.25) and np.isclose(interval((1, 2, 3, 4)), 1.25)
+assert np.isclose(interval((4,)), 1 + 4 * 0.25), "At k = N alone the common answer is right."
+assert np.isclose(interval((1, 2, 3, 4)), 1.25), "From k = 1 on there is one step to come back."
 
 # %% [markdown]
 # **3.** The velocity falls by 0.2 rad/s in each step, so there are ten terms
 # $(2 - 0.2 j)^2 / 2$ in place of five. The slivers become larger.
 
 # %%
-removed = sum(Fraction(1, 100) * (2 - Fraction(1, 5) * j) ** 2 / 2 for j in range(10))
-predicted = 12 - 2 * removed
-weak = jm.MPC(system, Q, R, horizon=20, states=limits, inputs=jm.Box([-1.0], [1.0]))
+half = u_max / 2
+predicted = exact_area(half)
+weak = jm.MPC(system, Q, R, horizon=N, states=limits, inputs=jm.Box([-half], [half]))
 computed = jm.feasible.feasible_polytope(weak).volume()
 print(f"predicted {predicted} = {float(predicted)}, computed {computed:.9f}")
-assert np.isclose(computed, float(predicted), rtol=1e-8) and predicted < area
+assert np.isclose(computed, float(predicted), rtol=1e-8), "The prediction is right."
+assert predicted < area, "The set becomes smaller."

@@ -8,7 +8,7 @@
 # ---
 
 # %% [markdown]
-# # Terminal sets and stability
+# # 3. Terminal sets and stability
 #
 # A plan ends after $N$ steps; the robot does not. You will see an MPC controller whose every plan
 # is optimal and whose closed loop falls over, and then repair it with a terminal cost and a
@@ -46,10 +46,11 @@ system = jm.LinearSystem.from_continuous(
     input_units=("N m",),
 )
 A, B = np.asarray(system.A), np.asarray(system.B)
-limits, torque = jm.Box([-0.5, -2.0], [0.5, 2.0]), jm.Box([-0.5], [0.5])
+x_max, u_max = np.array([0.5, 2.0]), 0.5
+limits, torque = jm.Box(-x_max, x_max), jm.Box([-u_max], [u_max])
 Q, R, N = np.diag([10.0, 1.0]), np.array([[10.0]]), 5
 print("eigenvalues of A:", np.sort(np.linalg.eigvals(A).real).round(4))
-assert np.abs(np.linalg.eigvals(A)).max() > 1
+assert np.abs(np.linalg.eigvals(A)).max() > 1, "The plant is unstable."
 
 # %% [markdown]
 # ## What goes wrong without terminal ingredients
@@ -77,7 +78,7 @@ def closed_loop(controller, x, steps):
 
 start = np.array([0.05, 0.0])
 fallen, fallen_inputs, _ = closed_loop(bare, start, 40)
-assert len(fallen_inputs) < 40
+assert len(fallen_inputs) < 40, "The pendulum falls until no plan exists."
 
 # %% [markdown]
 # Every plan up to there was optimal and kept all limits. Nevertheless the pendulum falls until no
@@ -94,8 +95,8 @@ for _ in range(N):
     P = Q + A.T @ P @ (A + B @ K_N)
 radius = np.abs(np.linalg.eigvals(A + B @ K_N)).max()
 print(f"spectral radius of the closed loop: {radius:.4f}")
-assert radius > 1
-assert np.allclose(fallen_inputs[0], K_N @ start, atol=1e-6)  # the MPC law is this gain
+assert radius > 1, "Without limits in the way the loop is unstable."
+assert np.allclose(fallen_inputs[0], K_N @ start, atol=1e-6), "The MPC law is this gain."
 
 # %% [markdown]
 # **Cause 2: the feasible set holds states that are lost.** Let $w'$ be the left eigenvector of the
@@ -107,12 +108,12 @@ assert np.allclose(fallen_inputs[0], K_N @ start, atol=1e-6)  # the MPC law is t
 eigenvalues, vectors = (part.real for part in np.linalg.eig(A.T))  # all are real
 unstable = int(np.argmax(eigenvalues))
 w, growth = vectors[:, unstable], eigenvalues[unstable]
-bound = abs(float((w @ B)[0])) * 0.5 / (growth - 1)
+bound = abs(float((w @ B)[0])) * u_max / (growth - 1)
 strip = jm.Polytope(np.stack([w, -w]), np.full(2, bound))
 feasible = jm.feasible.feasible_polytope(bare.mpc)
 lost = 1 - feasible.intersect(strip).volume() / feasible.volume()
 print(f"{100 * lost:.1f} % of the feasible set is lost whatever the controller does")
-assert lost > 0.2
+assert lost > 0.2, "A good part of the feasible set is lost."
 
 # %% [markdown]
 # ## The repair
@@ -149,7 +150,7 @@ mpc = jm.MPC(
 # %%
 report = jm.sets.verify_terminal(system, Q, R, P, terminal_set, limits, torque)
 print(report)
-assert report.recursive_feasibility and report.stability
+assert report.recursive_feasibility and report.stability, "Both theorems apply."
 
 # %% [markdown]
 # The same check on the first controller names what is missing:
@@ -157,7 +158,7 @@ assert report.recursive_feasibility and report.stability
 # %%
 missing = jm.sets.verify_terminal(system, Q, R, np.zeros((2, 2)), None, limits, torque)
 print("\n".join(str(missing).splitlines()[:2]))
-assert not missing.recursive_feasibility and not missing.stability
+assert not missing.recursive_feasibility and not missing.stability, "Neither applies."
 
 # %% [markdown]
 # ## Sets and trajectories
@@ -170,14 +171,15 @@ assert not missing.recursive_feasibility and not missing.stability
 repaired = jm.Controller(mpc)
 honest = jm.feasible.feasible_polytope(mpc)
 given_up = feasible.volume() - honest.volume()
-assert lost * feasible.volume() > 0.5 * given_up  # most of it was lost anyway
+assert lost * feasible.volume() > 0.5 * given_up, "Most of what it gave up was lost anyway."
 corners = honest.vertices()
 far = 0.98 * corners[np.argmax(corners @ w)]
 near_states, _, _ = closed_loop(repaired, start, 60)
 states, inputs, costs = closed_loop(repaired, far, 60)
-assert len(inputs) == 60 and len(near_states) == 61
-assert np.abs(states[-1]).max() < 1e-3 and np.abs(near_states[-1]).max() < 1e-3
-assert np.all(np.abs(states) <= [0.5 + 1e-6, 2 + 1e-6])
+assert len(inputs) == 60 and len(near_states) == 61, "There is a plan at each step."
+for ended in (states[-1], near_states[-1]):
+    assert np.abs(ended).max() < 1e-3, "The pendulum stands upright in the end."
+assert np.all(np.abs(states) <= x_max + 1e-6), "All limits are kept."
 
 # %%
 figure, axis = plt.subplots(figsize=(7, 4), layout="constrained")
@@ -187,13 +189,14 @@ for body, color, name in (
     (terminal_set, "#8fcfb4", "terminal set"),
 ):
     axis.fill(*body.vertices().T, color=color, label=name, lw=0)
-line = np.array([-0.5, 0.5])
+line = np.array([-1.0, 1.0]) * x_max[0]
 for sign in (-1, 1):
     label = "limit of what can be saved" if sign == 1 else None
     axis.plot(line, (sign * bound - w[0] * line) / w[1], "--", color="0.4", lw=1, label=label)
 axis.plot(*fallen.T, ".-", color="#d55e00", label="falls")
 axis.plot(*states.T, ".-", color="#00486b", label="returns")
-axis.set(xlabel="angle [rad]", ylabel="rate [rad/s]", xlim=(-0.55, 0.55), ylim=(-2.1, 2.1))
+axis.set(xlabel="angle [rad]", ylabel="rate [rad/s]", xlim=1.1 * line)
+axis.set_ylim(-1.05 * x_max[1], 1.05 * x_max[1])
 figure.legend(loc="outside right upper", fontsize=8)
 plt.show()
 
@@ -212,7 +215,7 @@ plt.show()
 paid = np.einsum("ki,ij,kj->k", states[:-1], Q, states[:-1]) + R[0, 0] * inputs[:, 0] ** 2
 excess = costs[1:] - costs[:-1] + paid[:-1]
 print(f"largest V(x+) - V(x) + stage cost: {excess.max():.1e}, for V up to {costs[0]:.1f}")
-assert np.all(excess <= 1e-6)
+assert np.all(excess <= 1e-6), "The optimal cost falls by at least the stage cost."
 
 # %%
 time = 0.05 * np.arange(60)
@@ -242,7 +245,7 @@ plt.show()
 closed = A + B @ K
 residual = closed.T @ P @ closed - P + Q + K.T @ R @ K
 print(f"largest entry: {np.abs(residual).max():.1e}, for P up to {np.abs(P).max():.0f}")
-assert np.abs(residual).max() < 1e-9 * np.abs(P).max()
+assert np.abs(residual).max() < 1e-9 * np.abs(P).max(), "The identity holds."
 
 # %% [markdown]
 # **2.** Run the Riccati recursion and look at the spectral radius. Stability near the origin says
@@ -250,14 +253,14 @@ assert np.abs(residual).max() < 1e-9 * np.abs(P).max()
 
 # %%
 P_k, stable_from = np.zeros((2, 2)), None
-for horizon in range(1, 16):
+for horizon in range(1, 40):
     gain = -np.linalg.solve(R + B.T @ P_k @ B, B.T @ P_k @ A)
     P_k = Q + A.T @ P_k @ (A + B @ gain)
     radius = np.abs(np.linalg.eigvals(A + B @ gain)).max()
     if stable_from is None and radius < 1:
         stable_from = horizon
         print(f"stable from N = {horizon} on, spectral radius {radius:.4f}")
-assert stable_from == 9
+assert stable_from == 9, "Stable from N = 9 on."
 
 # %% [markdown]
 # **3.** The ellipsoid lies inside the polytope, which is the largest set of all.
@@ -266,4 +269,5 @@ assert stable_from == 9
 ellipsoid = jm.sets.invariant_ellipsoid(system, K, P, limits, torque)
 share = ellipsoid.volume() / terminal_set.volume()
 print(f"ellipsoid {ellipsoid.volume():.4f}, polytope {terminal_set.volume():.4f}: {share:.0%}")
-assert all(bool(terminal_set.contains(x, 1e-9)) for x in ellipsoid.boundary(100))
+inside = all(bool(terminal_set.contains(x, 1e-9)) for x in ellipsoid.boundary(100))
+assert inside, "The ellipsoid lies inside the polytope."

@@ -8,7 +8,7 @@
 # ---
 
 # %% [markdown]
-# # Soft constraints
+# # 4. Soft constraints
 #
 # A controller must do something even where no plan keeps all limits. You will soften the limits of
 # the robot joint with slack variables, and see that a penalty that is too small gives limits away
@@ -45,7 +45,8 @@ system = jm.LinearSystem(
     input_names=("torque",),
     input_units=("N m",),
 )
-limits, torque = jm.Box([-1.5, -2.0], [1.5, 2.0]), jm.Box([-2.0], [2.0])
+q_max, dq_max, u_max = 1.5, 2.0, 2.0
+limits, torque = jm.Box([-q_max, -dq_max], [q_max, dq_max]), jm.Box([-u_max], [u_max])
 Q, R = np.diag([50.0, 1.0]), np.array([[0.1]])
 P = np.asarray(jm.lqr(system, Q, R).P)
 hard = jm.MPC(system, Q, R, N, limits, torque, terminal_cost=P, terminal_set=limits)
@@ -54,7 +55,8 @@ feasible = jm.feasible.feasible_polytope(hard)
 pushed = np.array([1.46, 1.9])
 print("within the limits:", bool(limits.contains(pushed)))
 print("in the feasible set:", bool(feasible.contains(pushed)))
-assert bool(limits.contains(pushed)) and not bool(feasible.contains(pushed))
+assert bool(limits.contains(pushed)), "The joint is within its limits."
+assert not bool(feasible.contains(pushed)), "But its braking distance is too long."
 
 # %% [markdown]
 # `soften` replaces each limit $h$ on a state by $h + \varepsilon$ with a slack
@@ -66,17 +68,19 @@ soft = jm.soften(hard, rho=1000.0)
 plan = jm.solve(soft, pushed)
 slack = np.asarray(plan.slack)
 print(plan.sentence)
-print(f"q goes up to {np.asarray(plan.states)[:, 0].max():.4f} rad")
-assert int(plan.status) == jm.Status.SOLVED
-# Braking with full torque takes 0.055 rad from 1.9 rad/s, so 1.515 rad is the least possible.
-assert np.isclose(np.asarray(plan.states)[:, 0].max(), 1.46 + 0.055, atol=1e-6)
+highest = np.asarray(plan.states)[:, 0].max()
+braking = T * np.arange(pushed[1], 0, -T / J * u_max).sum()  # with full torque, see notebook 00
+print(f"q goes up to {highest:.4f} rad; braking takes {braking:.4f} rad")
+assert int(plan.status) == jm.Status.SOLVED, "The soft problem has a plan."
+assert np.isclose(highest, pushed[0] + braking, atol=1e-6), "The violation is the least possible."
 
 # %%
 time = T * np.arange(N + 1)
 figure, axis = plt.subplots(figsize=(6, 3.2), layout="constrained")
-axis.axhspan(1.5, 1.53, color="#d55e00", alpha=0.25, lw=0)
+axis.axhspan(q_max, q_max + 0.03, color="#d55e00", alpha=0.25, lw=0, label="beyond the limit")
 axis.plot(time, np.asarray(plan.states)[:, 0], ".-", color="#00486b")
-axis.set(xlabel="time [s]", ylabel="q [rad]", ylim=(1.38, 1.53))
+axis.set(xlabel="time [s]", ylabel="q [rad]", ylim=(q_max - 0.12, q_max + 0.03))
+axis.legend(loc="lower right")
 axis.set_title("After a push: the least possible violation", fontsize=11)
 plt.show()
 
@@ -87,20 +91,25 @@ plt.show()
 # problem has a plan. We choose $\rho = 10$, which may look large beside $R = 0.1$.
 
 # %%
+small = 10.0
 x0 = np.array([-1.2, 0.1])
 reference_plan = jm.solve(hard, x0)
-assert int(reference_plan.status) == jm.Status.SOLVED and bool(feasible.contains(x0))
-cheap = jm.solve(jm.soften(hard, rho=10.0), x0)
+assert int(reference_plan.status) == jm.Status.SOLVED, "All limits can be kept from here."
+cheap = jm.solve(jm.soften(hard, rho=small), x0)
 peaks = [float(np.asarray(p.states)[:, 1].max()) for p in (reference_plan, cheap)]
-print(f"largest velocity: hard {peaks[0]:.4f} rad/s, soft with rho = 10: {peaks[1]:.4f} rad/s")
-assert peaks[0] <= 2 + 1e-6 < 2.05 < peaks[1]
+print(f"largest velocity: hard {peaks[0]:.4f} rad/s")
+print(f"soft with rho = {small:g}: {peaks[1]:.4f} rad/s")
+assert peaks[0] <= dq_max + 1e-6, "The hard plan keeps the limit."
+assert peaks[1] > dq_max + 0.05, "The soft one breaks it."
 
 # %%
 figure, axis = plt.subplots(figsize=(6, 3.2), layout="constrained")
-axis.axhspan(2.0, 5.0, color="#d55e00", alpha=0.25, lw=0)
-for p, color, label in ((reference_plan, "#00486b", "hard"), (cheap, "#d55e00", "soft, ρ = 10")):
-    axis.plot(time, np.asarray(p.states)[:, 1], ".-", color=color, label=label)
-axis.set(xlabel="time [s]", ylabel="dq [rad/s]", ylim=(0, 1.08 * peaks[1]))
+top = 1.08 * max(*peaks, dq_max)
+axis.axhspan(dq_max, top, color="#d55e00", alpha=0.25, lw=0, label="beyond the limit")
+axis.plot(time, np.asarray(reference_plan.states)[:, 1], ".-", color="#00486b", label="hard")
+soft_name = f"soft, ρ = {small:g}"
+axis.plot(time, np.asarray(cheap.states)[:, 1], ".-", color="#d55e00", label=soft_name)
+axis.set(xlabel="time [s]", ylabel="dq [rad/s]", ylim=(0, top))
 axis.legend(loc="lower right")
 plt.show()
 
@@ -118,18 +127,19 @@ plt.show()
 
 # %%
 line = np.stack([np.linspace(-1.49, 1.49, 81), np.full(81, 0.1)], axis=1)
-result = jm.explicit.exact_penalty(hard, np.vstack([x0, line]), rho=10.0)
+result = jm.explicit.exact_penalty(hard, np.vstack([x0, line]), rho=small)
 print(result.sentence)
 threshold = float(result.thresholds[0])
 print(f"threshold at x0: {threshold:.4f}")
-assert result.exact and result.sufficient is False
-assert 10 < threshold < result.rho_bar
+assert result.exact, "All critical regions were found."
+assert result.sufficient is False and small < threshold, "This penalty is too small."
+assert threshold < result.rho_bar, "Other states need a larger one."
 
 # %%
 figure, axis = plt.subplots(figsize=(6, 3.2), layout="constrained")
-axis.plot(line[:, 0], result.thresholds[1:], color="#00486b", label="at dq = 0.1 rad/s")
+axis.plot(line[:, 0], result.thresholds[1:], color="#00486b", label=f"at dq = {x0[1]:g} rad/s")
 axis.axhline(result.rho_bar, color="#d55e00", ls="--", label="supremum over the feasible set")
-axis.plot(x0[0], threshold, "o", color="#00486b")
+axis.plot(x0[0], threshold, "o", color="#00486b", label="at x0")
 axis.set(xlabel="q [rad]", ylabel="threshold of ρ [cost per unit]", ylim=(-1, None))
 axis.legend(loc=(0.26, 0.55), fontsize=9)
 plt.show()
@@ -145,10 +155,11 @@ factors = np.array([0.2, 0.4, 0.6, 0.8, 0.9, 0.95, 0.99, 1.01, 1.1, 1.5, 2.0])
 largest = []
 for factor in factors:
     answer = jm.solve(jm.soften(hard, rho=factor * threshold), x0)
-    assert int(answer.status) == jm.Status.SOLVED
+    assert int(answer.status) == jm.Status.SOLVED, "Soft problems have plans."
     largest.append(float(np.asarray(answer.slack).max()))
 largest = np.array(largest)
-assert np.all(largest[factors > 1] < 1e-7) and np.all(largest[factors < 1] > 1e-5)
+assert np.all(largest[factors > 1] < 1e-7), "Above the threshold there is no slack."
+assert np.all(largest[factors < 1] > 1e-5), "Below it there is some."
 
 # %%
 figure, axis = plt.subplots(figsize=(6, 3.2), layout="constrained")
@@ -182,8 +193,9 @@ plt.show()
 # %%
 for rho in (1e-3, 1.0, 1e3):
     answer = jm.solve(jm.soften(hard, rho=rho), np.array([0.05, -0.1]))
-    print(f"rho = {rho:g}: largest slack {float(np.asarray(answer.slack).max()):.1e}")
-    assert float(np.asarray(answer.slack).max()) < 1e-9
+    most = float(np.asarray(answer.slack).max())
+    print(f"rho = {rho:g}: largest slack {most:.1e}")
+    assert most < 1e-9, "The slack is zero for every rho."
 
 # %% [markdown]
 # **2.** From none. At $\varepsilon = 0$ the derivative of $k \varepsilon^2$ is zero, so that a
@@ -195,7 +207,8 @@ for k in (1e2, 1e3, 1e4):
     answer = jm.solve(jm.soften(hard, rho=0.0, quadratic=k), x0)
     violations.append(float(np.asarray(answer.slack).max()))
     print(f"k = {k:g}: largest slack {violations[-1]:.2e} rad/s")
-assert np.all(np.array(violations) > 1e-5) and np.all(np.diff(violations) < 0)
+assert np.all(np.array(violations) > 1e-5), "The slack never vanishes."
+assert np.all(np.diff(violations) < 0), "It shrinks."
 
 # %% [markdown]
 # **3.** It is the largest multiplier of a limit on the state or on the terminal state.
@@ -207,4 +220,4 @@ found = max(
     float(np.abs(np.asarray(multipliers.terminal)).max()),
 )
 print(f"largest multiplier {found:.6f}, threshold {threshold:.6f}")
-assert np.isclose(found, threshold, rtol=1e-6)
+assert np.isclose(found, threshold, rtol=1e-6), "The threshold is the largest multiplier."

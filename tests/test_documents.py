@@ -97,12 +97,14 @@ def holds_tuning(after, said):
 def holds_learning(after, said):
     """The expert's inputs are found; modules have gradients of both their parts."""
     assert after[1]["value"] < 1e-6
+    history = after[5]["history"]  # of weights and the model
+    assert history[-1] < 0.5 * history[0] and max(history) < 1.01 * history[0]
     theta, network = after[2]["gradient"].theta, after[2]["gradient"].network
     assert all(np.abs(v).max() > 0 for v in (*theta.values(), network.layers[0].weight))
     assert np.abs(after[3]["gradient"]["theta"].get_value()["Q"]).max() > 0
     assert after[4]["states"].shape == (64, 20, 2)
-    assert "'inputs.upper': (5,)" in said and after[6]["plans"].inputs.shape == (3, 5, 1)
-    assert after[6]["plans"].solved.all()
+    assert "'inputs.upper': (5,)" in said and after[7]["plans"].inputs.shape == (3, 5, 1)
+    assert after[7]["plans"].solved.all()
 
 
 def holds_theory(after, said):

@@ -293,6 +293,20 @@ class RobotController:
         vars(self).update(exact=exact or sqp_steps > 1, sqp_steps=sqp_steps, hessian=hessian)
         vars(self).update(_prepared(self, solver), solver=arrays(solver))
 
+    def __repr__(self) -> str:
+        """Return in one line what it controls and how: the robot, the horizon, where the linear
+        model is taken, and the solver's steps."""
+        if self.fixed is not None:
+            model = "one linear model, at the set-point"
+        else:
+            where = "the state" if self.linearize == "state" else "the predicted trajectory"
+            model = f"a linear model at {where} at each sample"
+        tasks = f", {len(self.tasks)} tasks" if self.tasks else ""
+        sqp = f", at most {self.sqp_steps} SQP steps" if self.sqp_steps > 1 else ""
+        name = getattr(self.robot, "name", type(self.robot).__name__)
+        horizon = f"horizon {self.mpc.horizon}, soft state limits"
+        return f"RobotController({name}, {horizon}, {model}{tasks}{sqp})"
+
     @property
     def dtype(self) -> Any:
         """Return the precision of the plans."""

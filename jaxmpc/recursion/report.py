@@ -76,7 +76,7 @@ class RecursionReport:
             for name, count in counts.items():
                 why = f" ({self.loops.why_undecided()})" if name == "undecided" and count else ""
                 share = f"{count / max(feasible, 1):8.3%} of the feasible{why}"
-                rows.append((f"- {name}", f"{count:>10,}  {share}"))
+                rows.append((f"- {name.replace('one', '1')}", f"{count:>10,}  {share}"))
         else:
             why = "its law is proved" if self.law.holds else "no time was left for them"
             rows.append(("samples", f"none: {why}"))

@@ -100,6 +100,8 @@ class TerminalReport:
         width = max(len(check.name) for check in self.checks)
         for check in self.checks:
             margin = "" if check.margin is None else f"{check.margin:.6g} {check.unit}"
+            if check.margin is not None and check.margin < 0 and check.holds:
+                margin = f"0 {check.unit}, to rounding"
             needed = ",".join(map(str, check.theorems))
             line = f"{words[check.holds]:>3}  {check.name:<{width}}  {needed:<3}  {margin}"
             lines += [line.rstrip(), f"     {check.sentence}"]

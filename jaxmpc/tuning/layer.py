@@ -22,6 +22,7 @@ from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.plan import Control, Plan
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.admm import ADMM, DEFAULT
+from jaxmpc.systems.riccati import lqr
 from jaxmpc.tuning.parameters import (
     Parameter,
     exact_values,
@@ -31,8 +32,9 @@ from jaxmpc.tuning.parameters import (
     values,
 )
 
-# Short names of what lies in the system.
-SHORT = {"A": "system.A", "B": "system.B", "c": "system.c"}
+# Short names of what lies in the system, and of the terminal weight.
+SHORT = {"A": "system.A", "B": "system.B", "c": "system.c", "P": "terminal_cost"}
+TERMINAL_WEIGHTS = ("given", "lqr")
 # Fields whose values are positive definite matrices, and others that stay positive.
 MATRICES = ("Q", "R", "terminal_cost", "input_rate_weight")
 POSITIVE = ("stage_weights", "rho", "quadratic", "radius")
@@ -47,14 +49,20 @@ class MPCLayer:
 
     Arguments:
         mpc: The problem; what is not learned stays as it is here.
-        learn: Names of fields of the problem: "Q", "R", "terminal_cost", "stage_weights", …, with a
-            dot those of its parts, "inputs.upper", "soft.rho"; "A", "B", "c" of the system. They
-            may differ from step to step. Or a mapping of such names to a `Parameter`, which says
-            the domain, the start and the entries that are trained. Without one Q, R and other
+        learn: Names of fields of the problem: "Q", "R", "P" or "terminal_cost", "stage_weights", …,
+            with a dot those of its parts, "inputs.upper", "soft.rho"; "A", "B", "c" of the system.
+            They may differ from step to step. Or a mapping of such names to a `Parameter`, which
+            says the domain, the start and the entries that are trained. Without one Q, R and other
             weights stay diagonal where they are, and positive definite; penalties stay positive;
             all else is real.
         solver: Settings of the solver: `smoothing` for derivatives that see limits before they are
             reached, `eps`, and so on.
+        terminal_weight: "given": P is that of the problem, unless it is learned; "lqr": at each θ
+            it is the P of `jm.lqr` for its A, B, Q and R, and so are the derivatives.
+
+    A step of Adam moves every entry of θ by its learning rate. Of weights θ is a logarithm, of A, B
+    and c the entry itself: 0.1 is a tenth of a weight and much of a model. Give these a learning
+    rate of their own (`optax.multi_transform`).
 
     A layer is no pytree: in a module of Equinox mark it as static, in one of Flax it is already. It
     may be called in `jax.jit`, `jax.vmap`, `jax.grad`, `jax.lax.scan`. Raises ValueError for names
@@ -67,9 +75,12 @@ class MPCLayer:
         mpc: MPC,
         learn: Sequence[str] | Mapping[str, Parameter] = ("Q", "R"),
         solver: ADMM = DEFAULT,
+        terminal_weight: str = "given",
     ) -> None:
         require_kind("mpc", mpc, MPC)
         require_kind("solver", solver, ADMM)
+        if terminal_weight not in TERMINAL_WEIGHTS:
+            fail("terminal_weight", f"{terminal_weight!r}", 'Give "given" or "lqr"')
         if not concrete(mpc):
             fail("mpc", "holds traced arrays", "Make the layer outside jax.jit, and learn these")
         names = [learn] if isinstance(learn, str) else list(learn)
@@ -85,7 +96,13 @@ class MPCLayer:
                 fail(f"learn[{name!r}]", f"shape {shape}", f"Needed: {np.shape(parts[name])}")
         mpc.validate()
         solver.validate()
+        if terminal_weight == "lqr":
+            mpc.require_constant("the LQR is that of one problem", "A", "B", "Q", "R")
+            if learned := {"P", "terminal_cost"} & set(found):
+                problem = f"'lqr', and {learned.pop()} is learned itself"
+                fail("terminal_weight", problem, "Leave one of the two out")
         self.mpc, self.solver, self.parameters = mpc, solver, found
+        self.terminal_weight = terminal_weight
 
     def __repr__(self) -> str:
         learned = ", ".join(f"{name} ({p.domain})" for name, p in self.parameters.items())
@@ -105,7 +122,10 @@ class MPCLayer:
             given, needed = ", ".join(theta), ", ".join(self.parameters)
             fail("theta", f"has the names {given or 'none'}", f"Needed: {needed}, as from init()")
         found = values(self.parameters, theta)
-        return reduce(lambda mpc, name: _with(mpc, _path(name), found[name]), found, self.mpc)
+        mpc = reduce(lambda mpc, name: _with(mpc, _path(name), found[name]), found, self.mpc)
+        if self.terminal_weight == "lqr":
+            mpc = replace(mpc, terminal_cost=lqr(mpc.system, mpc.Q, mpc.R).P)
+        return mpc
 
     def controller(self, theta: Mapping[str, Any]) -> Controller:
         """Return the controller at θ: of many calls with one θ, such as a closed loop, the problem
@@ -144,7 +164,7 @@ def _at(mpc: MPC, name: str) -> np.ndarray:
     try:
         value = attrgetter(".".join(_path(name)))(mpc)
     except AttributeError:
-        known = 'such as "Q", "R", "terminal_cost", "A", "B", "c", "inputs.upper"'
+        known = 'such as "Q", "R", "P", "A", "B", "c", "inputs.upper"'
         fail("learn", f"{name!r} is no field of the problem", f"Give names {known}")
     if value is None:
         fail("learn", f"{name!r} is None in the problem", "Give it a value to start from")

@@ -70,19 +70,25 @@ class ClosedLoopLoss:
 
     def __call__(self, run: Run) -> Array:
         """Return the loss of one run."""
+        terms = self.terms(run)
+        return sum(terms.values(), jnp.zeros((), run.inputs.dtype))
+
+    def terms(self, run: Run) -> dict[str, Array]:
+        """Return what the loss of one run is the sum of: tracking, effort, and violation and
+        settling where these have a weight."""
         T, dtype = run.inputs.shape[0], run.inputs.dtype
         x = self._coordinates(run)
         e, v = x - self._aim(self.reference, T + 1), run.inputs - self._aim(self.input_reference, T)
         square = lambda v, W: jnp.sum(v * matmul(v, jnp.asarray(W, dtype)))
-        total = (square(e[:-1], self.Q) + square(v, self.R)) / T
+        terms = {"tracking": square(e[:-1], self.Q) / T, "effort": square(v, self.R) / T}
         if self.limits is not None and self.violation:
-            total = total + self.violation * jnp.sum(self.excess(x)) / T
+            terms["violation"] = self.violation * jnp.sum(self.excess(x)) / T
         if self.settling:
             d = jnp.max(jnp.abs(e[1:]) / jnp.asarray(self.band, dtype), axis=1)
             inside = jax.nn.log_sigmoid((1 - d) / self.softness)
             stays = jnp.exp(jnp.cumsum(inside[::-1])[::-1])
-            total = total + self.settling * jnp.sum(1 - stays)
-        return total
+            terms["settling"] = self.settling * jnp.sum(1 - stays)
+        return terms
 
     def excess(self, x: Array) -> Array:
         """Return by how much the states x (T+1, n) violate each row of the limits, (T+1, rows)."""

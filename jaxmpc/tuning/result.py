@@ -24,7 +24,7 @@ from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import record
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.tuning.descent import Descent, Settings
-from jaxmpc.tuning.parameters import Parameters, exact_values, trajectory
+from jaxmpc.tuning.parameters import Parameters, exact_values, is_diagonal, trajectory
 
 CHECKPOINT = "checkpoint.npz"
 # Where the files of a run that is overwritten wait.
@@ -77,6 +77,34 @@ class TuningRun:
             history,
             trajectory(parameters, history.thetas),
         )
+
+    @property
+    def unmoved(self) -> list[str]:
+        """Return the names whose values are the same at every step: the loss did not depend on
+        them. Empty where the run comes from a cache."""
+        moves = {
+            name: np.ptp(np.asarray(v), axis=0) for name, v in self.trace.items() if len(v) > 1
+        }
+        return [name for name, move in moves.items() if not np.any(move)]
+
+    def __repr__(self) -> str:
+        """Return the loss, the values and the other numbers before and after, one a line."""
+        number, best = "{:.6g}".format, ""
+        if self.history is not None:
+            best = f", best of {self.history.steps} steps at step {self.history.best}"
+        words = f"{self.improvement:.1%} less" if self.improved else "no step is better"
+        loss = number(self.before["loss"]), number(self.after["loss"])
+        rows = [("loss", *loss, f"{words}{best}")]
+        for name in self.values:
+            note = "never moved: no derivative" if name in self.unmoved else ""
+            rows.append((name, _few(self.initial[name]), _few(self.values[name]), note))
+        others = [name for name in self.before if name != "loss"]
+        rows += [(k, number(self.before[k]), number(self.after.get(k, np.nan)), "") for k in others]
+        lines = ["TuningRun, before and after, measured on the validation set:"]
+        for name, first, last, note in rows:
+            line = f"  {name:<12} {first} -> {last}"
+            lines.append(f"{line}  ({note})" if note else line)
+        return "\n".join(lines)
 
     @property
     def result(self) -> Any:
@@ -132,6 +160,19 @@ class TuningRun:
             "values_by_step": listed(self.trace),
             "seconds": h.seconds,
         }
+
+
+def _few(value: np.ndarray) -> str:
+    """Return a value as text of one line: a diagonal matrix by its diagonal, a large one by its
+    shape."""
+    value = np.asarray(value)
+    square = value.ndim == 2 and value.shape[0] == value.shape[1] and value.size > 1
+    if square and is_diagonal(value):
+        return f"diag{_few(np.diag(value))}"
+    if value.size > 16:
+        return f"{value.dtype} {value.shape}"
+    listed = np.array2string(value, precision=5, separator=", ", max_line_width=10**6)
+    return listed.replace("\n", "")
 
 
 class Interrupted(KeyboardInterrupt):

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxmpc.arrays import Reals
@@ -104,9 +105,16 @@ class WeightTask:
                 variations={name: v[-count:] for name, v in self.variations.items()},
             )
 
+    def terms(self, run: Run) -> dict[str, float]:
+        """Return the mean over the loops of each term of the loss."""
+        with jax.enable_x64(self.dtype == "float64"):
+            each = jax.jit(jax.vmap(self.loss.terms))(jax.tree.map(jnp.asarray, run))
+        return {name: float(np.mean(term)) for name, term in each.items()}
+
     def counts(self, run: Run, tolerance: float) -> dict[str, float]:
         """Return fractions of loops and plans from states and inputs alone: violated, unsolved,
-        infeasible, fallback, at_target (within this fraction of half the range of each state)."""
+        infeasible, unproved, fallback, at_target (within this fraction of half the range of each
+        state)."""
         goal = np.zeros(self.plant.n) if self.reference is None else self.reference
         outcome = evaluate_runs(run, self.plant, goal, tolerance=tolerance)
         kept = outcome.kept
@@ -121,6 +129,9 @@ class WeightTask:
             "kept_to": TOLERANCE["float64"],
             "unsolved": float(np.mean(status != Status.SOLVED)),
             "infeasible": float(np.mean(status == Status.PRIMAL_INFEASIBLE)),
+            "unproved": float(
+                np.mean((status != Status.SOLVED) & (status != Status.PRIMAL_INFEASIBLE))
+            ),
             "fallback": float(np.mean((status == Status.SOLVED) & np.asarray(run.fallback))),
             "at_target": float(np.mean(outcome.reached)),
         }
@@ -162,7 +173,11 @@ def weight_parameters(
         found[name] = Parameter(value, domain)
     if "rho" in tune:
         if not rho:
-            fail("tune rho", "the problem has no soft limits", "Give it [cost] rho")
+            cure = (
+                'Give it [cost] rho = "exact", or a number in cost per unit of a violated limit: '
+                "limits of states and the terminal set become soft"
+            )
+            fail("tune rho", "the problem has no soft limits", cure)
         found["rho"] = Parameter(rho, "positive")
     if "tightening" in tune:
         if not isinstance(limits, Box):

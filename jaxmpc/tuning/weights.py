@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jax import Array
+from jax.errors import ConcretizationTypeError, TracerArrayConversionError
 from jax.flatten_util import ravel_pytree
 
 from jaxmpc.arrays import Reals
@@ -128,7 +129,13 @@ def tune_weights(
     start = raw(parameters)
     initial = {name: np.asarray(p.value) for name, p in parameters.items()}
     build = partial(controller_of, make_mpc, solver=SOLVER if solver is None else solver)
-    controller = build(initial)
+    try:
+        controller = build(initial)
+    except KeyError as error:
+        if error.args[:1] and error.args[0] not in initial:
+            cure = f"Add it, or use some of {', '.join(initial)}"
+            fail("parameters", f"have no {error.args[0]!r}, which make_mpc asks for", cure)
+        raise
     if loss is None:
         aims = (aim(initial) if callable(aim) else aim for aim in (reference, input_reference))
         loss = _default_loss(controller, plant, *aims)
@@ -285,7 +292,12 @@ class ClosedLoopObjective:
     def check(self, theta: Any, data: Data) -> None:
         """Trace the loss without compiling; raise its errors, and ValueError for a wrong shape."""
         x0s, varied = jax.tree.map(lambda v: v[:1], data)
-        total, aux = jax.eval_shape(self.total, *self.arguments(theta, x0s, varied, np.ones(1)))
+        try:
+            total, aux = jax.eval_shape(self.total, *self.arguments(theta, x0s, varied, np.ones(1)))
+        except (ConcretizationTypeError, TracerArrayConversionError) as error:
+            first = str(error).splitlines()[0]
+            cure = "Write them with jax.numpy, without float(), NumPy and if of arrays"
+            fail("loss, make_mpc", f"cannot be traced by JAX ({first})", cure)
         if aux["losses"].shape != (1,) or total.shape != ():
             fail("loss", f"has shape {aux['losses'].shape[1:]}", "Return one number")
 

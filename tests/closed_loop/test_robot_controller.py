@@ -52,6 +52,12 @@ def solve_by_clarabel(mpc, A, B, c, xi, reference, input_reference, *, penalty=P
     return problem.value, u.value, x.value, slack.value
 
 
+def test_a_controller_prints_what_it_does():
+    mpc = jm.robot_mpc(PLANT, np.eye(2), np.eye(1), 4)
+    text = repr(jm.RobotController(PLANT, mpc, linearize="set-point"))
+    assert "horizon 4, soft state limits, one linear model, at the set-point" in text
+
+
 # --- the pendulum inside tight limits --------------------------------------------------------
 
 # Gravity takes 9.81 sin 0.5 = 4.7 of the 5 N m at the end of the range.

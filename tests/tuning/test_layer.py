@@ -1,5 +1,7 @@
 """An MPC as a layer: what it returns, its derivatives, and what it refuses."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -95,6 +97,25 @@ def test_inputs_without_a_plan_are_within_the_limits():
 
 
 @pytest.mark.slow
+def test_the_terminal_weight_follows_what_is_learned(x64):
+    """It is the P of `lqr` at every θ, beside differences; and P is a name of the terminal cost."""
+    layer = jm.tuning.MPCLayer(MPC, ("Q", "R", "A"), terminal_weight="lqr")
+    theta = {name: value + 0.1 for name, value in layer.init().items()}
+    made = layer.problem(theta)
+    P = jm.lqr(made.system, made.Q, made.R).P
+    np.testing.assert_allclose(made.terminal_cost, P, rtol=1e-12)
+    corner = lambda r: layer.problem(theta | {"R": jnp.asarray(r)}).terminal_cost[0, 0]
+    slope = jax.grad(corner)(theta["R"])
+    np.testing.assert_allclose(slope, approx_fprime(theta["R"], corner, 1e-6), rtol=1e-4)
+    for learn, message in (("P", "P is learned itself"), ("terminal_cost", "terminal_cost is")):
+        mpc = replace(MPC, terminal_cost=np.eye(2))
+        assert jm.tuning.MPCLayer(mpc, learn).problem({learn: np.ones(2)}).terminal_cost[0, 1] == 0
+        with pytest.raises(ValueError, match=f"terminal_weight: 'lqr', and {message}"):
+            jm.tuning.MPCLayer(mpc, learn, terminal_weight="lqr")
+    with pytest.raises(ValueError, match='terminal_weight: .Q.. Give "given"'):
+        jm.tuning.MPCLayer(MPC, "Q", terminal_weight="Q")
+
+
 def test_a_closed_loop_carries_its_plans(layer):
     theta = layer.init()
 

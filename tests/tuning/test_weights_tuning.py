@@ -73,6 +73,26 @@ def test_validation_loss_falls_and_is_that_of_the_returned_values(tuned):
     assert record["numbers"]["unsolved"] == [0.0] * 12 and record["settings"]["mode"] == "forward"
 
 
+def test_a_run_prints_what_changed(tuned):
+    """Loss and values before and after, without the functions inside; and what never moved."""
+    text = repr(tuned)
+    assert "best of 12 steps" in text and "Q" in text and " -> " in text and "<" not in text
+    still = {**tuned.trace, "rho": np.full(13, 10.0)}
+    values = {**tuned.values, "rho": np.array(10.0)}
+    run = replace(tuned, values=values, initial=values, trace=still)
+    assert run.unmoved == ["rho"] and tuned.unmoved == []
+    assert "rho          10. -> 10.  (never moved: no derivative)" in repr(run)
+
+
+def test_losses_that_cannot_be_traced_are_named(x64):
+    for more, message in (
+        ({"loss": lambda run: float(run.states[-1, 0])}, "loss, make_mpc: cannot be traced by JAX"),
+        ({"make": lambda v: replace(MPC, Q=v["W"])}, "parameters: have no 'W', .*Q, R"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            tune(**more)
+
+
 @pytest.mark.slow
 def test_reverse_mode_checkpoint_and_forward_mode_agree(tuned, tmp_path):
     """The same run by the transposed derivative, cut off and taken up again."""
@@ -290,6 +310,11 @@ def test_loss_in_closed_form(x64):
     np.testing.assert_allclose(
         ClosedLoopLoss([0, 0], [0], **settle)(run_of(states, inputs)), 1.0, atol=1e-9
     )
+    terms = ClosedLoopLoss([2.0, 4.0], [3.0], limits=box, **(settle | {"violation": 7.0}))
+    found = terms.terms(run_of(states, inputs))
+    expected = [(2 * (4 + 1 + 0.16) + 4 * 0.26) / 3, 3 * 5 / 3, 7 * (0.5 / 1.25 + 0.3) / 3, 1.0]
+    np.testing.assert_allclose(list(found.values()), expected, atol=1e-9)
+    assert list(found) == ["tracking", "effort", "violation", "settling"]
     late = states.at[3, 0].set(1.0)  # it comes back out: three
     np.testing.assert_allclose(ClosedLoopLoss([0, 0], [0], **settle)(run_of(late, inputs)), 3.0)
 

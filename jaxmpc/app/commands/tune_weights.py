@@ -59,7 +59,8 @@ SHOWN = 24
 COUNTS = (
     ("violated", "violated", "of {loops} loops violate a limit"),
     ("unsolved", "unsolved", "of {plans:,} plans each"),
-    ("infeasible", "infeasible", "of all plans: unsolved, and proved infeasible"),
+    ("infeasible", "- infeasible", "of all plans: unsolved, and proved infeasible"),
+    ("unproved", "- unproved", "of all plans: unsolved, without such a proof"),
     ("fallback", "fallback", "of all plans: solved, with slack in soft limits"),
     ("at_target", "at target", "of {loops} loops at the end"),
 )
@@ -144,6 +145,7 @@ class TuneWeights(TuneWeightsOptions):
         before = task.simulate(lambda: run.build(run.initial))
         after = task.simulate(lambda: problem.load(folder / TUNED))
         counts = [task.counts(loops, self.tolerance) for loops in (before, after)]
+        terms = [task.terms(loops) for loops in (before, after)]
         document = {
             "name": task.name,
             "options": options,
@@ -153,8 +155,8 @@ class TuneWeights(TuneWeightsOptions):
                 "best_step": h.best,
                 "rejected": int(np.sum(~h.accepted)),
                 "validation": [float(h.validation[0]), float(h.validation[h.best])],
-                "before": counts[0],
-                "after": counts[1],
+                "before": counts[0] | {"loss": terms[0]},
+                "after": counts[1] | {"loss": terms[1]},
             },
             "this_run": seconds,
             "states_without_plan": problem.without_plan,
@@ -189,7 +191,7 @@ class TuneWeights(TuneWeightsOptions):
             save(plot_maps(*maps), folder / "maps.png", config.name)
             files.insert(4, "maps.png")
         return [
-            *weight_rows(problem, run, trace, counts),
+            *weight_rows(problem, run, trace, counts, terms),
             ("compile", f"{seconds['compile']:.1f} s"),
             ("run", f"{seconds['run']:.1f} s"),
             ("files", " ".join(str(folder / name) for name in files)),
@@ -418,8 +420,10 @@ def weight_rows(
     run: TuningRun,
     trace: Mapping[str, Mapping[str, np.ndarray]],
     counts: list[dict[str, float]],
+    terms: list[dict[str, float]],
 ) -> list[tuple[str, str]]:
-    """Return the rows of the table on losses, `counts` before and after, weights and steps."""
+    """Return the rows of the table on losses, their `terms` and `counts` before and after, weights
+    and steps."""
     h = run.history
     entries = [
         (f"{group} {name}".strip(), values[0], values[h.best])
@@ -432,6 +436,8 @@ def weight_rows(
         ("", two_columns(("before", "after"))),
         ("loss", two_columns((f"{first:.6g}", f"{last:.6g}"), change)),
     ]
+    for name in terms[0]:
+        rows.append((f"- {name}", two_columns(f"{part[name]:.6g}" for part in terms)))
     for key, name, of in COUNTS:
         shares = (f"{100 * numbers[key]:.2f} %" for numbers in counts)
         rows.append((name, two_columns(shares, of.format(**counts[0]))))
@@ -445,6 +451,9 @@ def weight_rows(
     own = isinstance(problem.task.plant, LinearPlant) and not problem.task.loss.settling
     if own and _same_weights(problem.task):
         rows.append(("loss", "about the cost that the controller minimises: little can be gained"))
+    if problem.task.loss.settling and not any(numbers["at_target"] for numbers in counts):
+        what = "is about the same for all weights, for no loop settles in the time that it has"
+        rows.append(("settling", f"{what}: raise --steps or --tolerance, or give --settling 0"))
     if not h.best:
         what = f"none of {h.steps} steps is better on the validation loops"
         rows.append(("result", f"{what}: {TUNED} is the start"))

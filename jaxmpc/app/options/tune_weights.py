@@ -60,15 +60,18 @@ class TuneWeightsOptions:
       An invariant or ellipsoidal terminal set stays the one from before tuning.
 
     How to read the table
-      loss        mean over the validation loops, before and after, and the change
+      loss        mean over the validation loops, before and after, and the change; below it its
+                  terms, in the new simulations: tracking, effort, violation, time to settle
       violated    validation loops that violate a limit of states or inputs by more than 1e-6 (of
                   the limit, where that is above 1), not counting the tightening
       unsolved    plans whose residuals exceed 1e-6 (along trajectories in float32 1e-3)
       infeasible  those of them that are proved infeasible
+      unproved    the others of them: inaccurate, stopped too early, or data not finite
       fallback    plans that are solved with slack: soft limits are violated on their horizon
       at target   loops that end within --tolerance of half the range of each state
       then        the weights
-      All but the loss is counted in new simulations, those after tuning with tuned.toml as written.
+      All but the loss itself is counted in new simulations, those after tuning with tuned.toml as
+      written.
 
     Files, all in the folder of --output
       tuned.toml        The whole problem with the tuned weights: for --config of jaxmpc sweep,
