@@ -573,11 +573,12 @@ def compiled_urdf(
         _add_motors(spec, mimics)
         return spec.compile(), velocities, changes
     except ValueError as error:
-        if "inertia" in str(error) and not mend_inertias:
-            problem = " ".join(str(error).split())
+        # Its lines are those of the copy without shapes.
+        problem = re.sub(r", line \d+", "", " ".join(str(error).split()))
+        if "inertia" in problem and not mend_inertias:
             cure = "Mend the file, or load it with mend_inertias=True"
             fail("model", f"has an inertia that no body can have: {problem}", cure)
-        raise
+        raise ValueError(problem) from error
 
 
 def parsed_urdf(text: str) -> ElementTree.Element:

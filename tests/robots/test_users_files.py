@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxmpc as jm
-from jaxmpc.robots.film import _camera
+from jaxmpc.robots.film import _camera, _ends
 from jaxmpc.robots.load import _warn_of_meshes
 
 URDF = """<?xml version="1.0"?>
@@ -33,6 +33,14 @@ def test_a_urdf_of_any_name(tmp_path):
     robot = jm.load_robot(path, floating_base=True, mend_inertias=True)
     assert robot.n == 14
     np.testing.assert_allclose(robot.mujoco.body_mass.sum(), 1.1, rtol=1e-3)
+
+
+def test_what_is_wrong_in_a_urdf_is_named(tmp_path):
+    """Without lines, which are not those of the file."""
+    path = Path(tmp_path / "comma.urdf")
+    path.write_text(URDF.replace('xyz="0 0 .5"', 'xyz="0, 0 .5"'))
+    with pytest.raises(ValueError, match="bad format in attribute 'xyz' Element 'origin'. Mend"):
+        jm.load_robot(path)
 
 
 def test_contacts_are_left_out_on_request(tmp_path):
@@ -70,7 +78,7 @@ def test_the_camera_sees_all_poses():
         <body pos="0 0 .5"><joint axis="0 1 0"/><geom type="capsule" size=".02"
         fromto="0 0 0 .6 0 .3" mass="1"/></body></body></worldbody></mujoco>""")
     poses = np.array([[-5.0, 0], [0, 1], [9, -2]])
-    camera, data = _camera(model, poses, 0.5), mujoco.MjData(model)
+    camera, data = _camera(model, _ends(model, poses), 0.5), mujoco.MjData(model)
     a, e = np.deg2rad([camera.azimuth, camera.elevation])
     ahead = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
     eye = camera.lookat - camera.distance * ahead
