@@ -80,7 +80,7 @@ figure, axis = plt.subplots(figsize=(6, 3.2), layout="constrained")
 axis.axhspan(q_max, q_max + 0.03, color="#d55e00", alpha=0.25, lw=0, label="beyond the limit")
 axis.plot(time, np.asarray(plan.states)[:, 0], ".-", color="#00486b")
 axis.set(xlabel="time [s]", ylabel="q [rad]", ylim=(q_max - 0.12, q_max + 0.03))
-axis.legend(loc="lower right")
+axis.legend(loc="lower left")
 axis.set_title("After a push: the least possible violation", fontsize=11)
 plt.show()
 

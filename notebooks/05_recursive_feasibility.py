@@ -68,11 +68,13 @@ print(report)
 worst = report.counterexample
 
 # %%
-assert report.strong.holds is report.law.holds is report.weak.holds is False
-assert np.isclose(worst.distance, 0.0474341649)
-assert np.allclose(np.abs(worst.state), [0.95, 1.0]) and np.prod(worst.state) < 0
-assert np.isclose(report.volume, 1043 / 400)  # the exact area of X_3
-assert np.isclose(report.lost_by_law, 0.02)
+claims = (report.strong, report.law, report.weak)
+assert all(claim.holds is False for claim in claims), "All three claims are refuted."
+assert np.isclose(worst.distance, 0.0474341649), "The next state is 0.0474 outside."
+assert np.allclose(np.abs(worst.state), [0.95, 1.0]), "The law is refuted by ±(0.95, -1)."
+assert np.prod(worst.state) < 0, "Position and velocity have opposite signs there."
+assert np.isclose(report.volume, 1043 / 400), "The exact area of X_3 is 1043/400."
+assert np.isclose(report.lost_by_law, 0.02), "The states lost have an area of 0.02."
 
 # %% [markdown]
 # All three claims are refuted. The law is refuted by $x = \pm(0.95, -1)$: this state has a feasible
@@ -81,7 +83,7 @@ assert np.isclose(report.lost_by_law, 0.02)
 # few random simulations could well miss them.
 
 # %%
-assert report.lost_by_law / report.volume < 0.01
+assert report.lost_by_law / report.volume < 0.01, "They are under 1 % of the whole set."
 
 # %% [markdown]
 # ## A failure on purpose
@@ -109,7 +111,7 @@ lost, states = first_loss(mpc, x0s)
 counts = {k: int(np.sum(lost == k)) for k in range(3)}
 print("infeasible at once, then lost at sample 1, 2:", list(counts.values()))
 print(f"the first loop: lost at sample {lost[0]}, at x = {states[1, 0]}")
-assert lost[0] == 1 and counts[1] > 0
+assert lost[0] == 1 and counts[1] > 0, "The first loop is lost after a single step."
 
 # %% [markdown]
 # The first loop stops with "no point satisfies the constraints" after a single step, although
@@ -127,13 +129,14 @@ fig, (left, right) = plt.subplots(1, 2, figsize=(8, 3.5))
 for axis in (left, right):
     axis.fill(*order(X3).T, color="0.9", label="$X_3$")
     axis.plot(*closed(X3).T, color="0.4", linewidth=1)
-    axis.set(xlabel="position (m)", ylabel="velocity (m/s)")
+    axis.set(xlabel="position [m]", ylabel="velocity [m/s]")
 gone = x0s[lost >= 1]
 left.plot(*gone.T, ".", color="#d55e00", markersize=4, label="lost later")
-left.plot(*worst.state, "k*", label="worst state")
-left.legend(loc="lower left")
+left.plot(*worst.state, "k*", markersize=11, markeredgecolor="w", zorder=4, label="worst state")
+left.set(xlim=(-1.1, 1.1), ylim=(-1.75, 1.15))
+left.legend(loc="lower center", ncols=3, fontsize=8, columnspacing=1, handlelength=1.2)
 sign = np.sign(worst.state[1])  # show the corner of the worst state
-right.plot(*gone.T, ".", color="#d55e00", markersize=4)
+right.plot(*gone.T, ".", color="#d55e00", markersize=4, label="lost later")
 right.annotate(
     "", xy=worst.next_state, xytext=worst.state, arrowprops=dict(arrowstyle="->", linewidth=1.2)
 )
@@ -141,10 +144,11 @@ a, b = worst.normal, worst.offset
 along = np.array([-a[1], a[0]]) / np.linalg.norm(a)
 foot = worst.next_state - (a @ worst.next_state - b) / (a @ a) * a
 right.plot(*np.stack([foot - along, foot + along]).T, "b--", linewidth=1, label="$a'x = b$")
-right.plot(*worst.state, "k*", *worst.next_state, "ko", markersize=5)
+right.plot(*worst.state, "k*", markersize=9, markeredgecolor="w", zorder=4, label="worst state")
+right.plot(*worst.next_state, "ko", markersize=5, label="next state")
 corner = np.sort(sign * np.array([[-1.05, 0.4], [0.2, 1.05]]), axis=1)
 right.set(xlim=corner[0], ylim=corner[1])
-right.legend(loc="lower right" if sign > 0 else "upper left")
+right.legend(loc="lower right" if sign > 0 else "upper left", fontsize=8)
 fig.tight_layout()
 
 # %% [markdown]
@@ -159,9 +163,10 @@ fig.tight_layout()
 # %%
 longer = jm.recursive_feasibility(replace(mpc, horizon=4))
 print(longer)
-assert longer.strong.holds and longer.law.holds
-assert np.isclose(longer.volume, 2.5875)
-assert np.isclose(report.volume - longer.volume, report.lost_by_law)
+assert longer.strong.holds and longer.law.holds, "With one step more it is proved."
+assert np.isclose(longer.volume, 2.5875), "The area of X_4 is 2.5875."
+refused = report.volume - longer.volume
+assert np.isclose(refused, report.lost_by_law), "It is smaller by just what was lost."
 
 # %% [markdown]
 # The area is smaller than that of $\mathcal X_3$ by just what was lost, 0.02: the longer horizon
@@ -180,10 +185,10 @@ terminal = jm.maximal_invariant_set(system, lqr.K, limits, mpc.inputs)
 safe = replace(mpc, terminal_set=terminal, terminal_cost=lqr.P)
 proof = jm.recursive_feasibility(safe)
 print(proof)
-assert proof.law.holds
+assert proof.law.holds, "With an invariant terminal set it is proved."
 small = jm.feasible_polytope(safe)
 print(f"area: {small.volume():.4f} with the terminal set, {longer.volume:.4f} with N = 4")
-assert terminal.volume() < small.volume() < longer.volume
+assert terminal.volume() < small.volume() < longer.volume, "The longer horizon costs fewer states."
 
 # %%
 fig, axis = plt.subplots(figsize=(6, 3.5))
@@ -194,7 +199,7 @@ for body, label, style in (
     (terminal, "terminal set", "0.5"),
 ):
     axis.plot(*closed(body.vertices()).T, color=style, label=label)
-axis.set(xlabel="position (m)", ylabel="velocity (m/s)")
+axis.set(xlabel="position [m]", ylabel="velocity [m/s]")
 axis.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))
 fig.tight_layout()
 
@@ -231,7 +236,7 @@ cases = {
 for name, (fields, expected) in cases.items():
     radius = jm.feasible_polytope(replace(scalar, **fields)).volume() / 2
     print(f"{name:10} |x_0| <= {radius:.4f}")
-    assert np.isclose(radius, expected)
+    assert np.isclose(radius, expected), f"With the limit at {name} it is {expected}."
 
 # %% [markdown]
 # **Answer 2.** All states with $1 < |x| \le 1 + 4 \cdot 2^{-N}$ are lost: the input cannot hold
@@ -250,7 +255,7 @@ for N in (1, 3, 6):
     )
     radius = jm.feasible_polytope(unstable).volume() / 2
     print(f"N = {N}: |x| <= {radius:.4f}")
-    assert np.isclose(radius, 1 + 4 * 2.0**-N)
+    assert np.isclose(radius, 1 + 4 * 2.0**-N), "The feasible set is |x| <= 1 + 4 / 2^N."
 x = 1.01  # the best that the input can do
 path = [x]
 while abs(path[-1]) <= 5:
@@ -264,4 +269,4 @@ print(f"from x = 1.01 the limit is broken after {len(path) - 1} steps, with the 
 # %%
 stronger = jm.recursive_feasibility(replace(mpc, inputs=jm.Box(-0.3, 0.3)))
 print(stronger)
-assert stronger.law.holds and stronger.weak.holds
+assert stronger.law.holds and stronger.weak.holds, "With the stronger drive the law holds."

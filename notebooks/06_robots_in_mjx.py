@@ -44,13 +44,14 @@ print(robot.report())
 # %%
 x_ref, u_ref = robot.equilibrium()
 print("home (rad, rad/s):", x_ref, "  torque that holds it (N m):", u_ref)
-assert np.abs(u_ref).max() > 0.1  # gravity acts
+assert np.abs(u_ref).max() > 0.1, "The arm needs torque against gravity."
 
 # %% [markdown]
 # ## The controller
 #
 # `robot_mpc` takes the limits of the model, tightens those of the state by 2 % to allow for errors
-# of the linear model, and chooses weights by Bryson's rule: one over the square of what is allowed.
+# of the linear model, and chooses weights by Bryson's rule: one over the square of what is allowed,
+# for velocities and inputs a hundredth of it, so that slow motion and effort are forgiven.
 # The input limits are hard. `RobotController` makes the state limits soft with a large penalty, so
 # that there is always a plan; `run.fallback` counts the plans that had to exceed a limit.
 
@@ -61,7 +62,7 @@ controller = jm.RobotController(robot, mpc)
 velocity = np.asarray(robot.state_limits.upper)[2:]
 torque = np.asarray(robot.input_limits.upper)
 print(f"control period {robot.dt} s, torque limits {torque} N m, velocity limits {velocity} rad/s")
-assert mpc.horizon == N and np.allclose(np.asarray(mpc.states.upper)[2:], 0.98 * velocity)
+assert np.allclose(mpc.states.upper[2:], 0.98 * velocity), "State limits are tightened by 2 %."
 
 # %% [markdown]
 # ## Sixty-four robots
@@ -77,7 +78,7 @@ count, half = 64, 32
 spread = np.concatenate([rng.uniform(-0.6, 0.6, (half, 2)), np.zeros((half, 2))], axis=1)
 away = x_ref + spread
 hold = np.array([robot.equilibrium(x[:2])[1] for x in away])
-assert np.all(np.abs(hold) <= torque)
+assert np.all(np.abs(hold) <= torque), "The motors can hold each target."
 
 x0s = np.concatenate([away, np.tile(x_ref, (half, 1))])
 x_goal = np.concatenate([np.tile(x_ref, (half, 1)), away])
@@ -91,8 +92,8 @@ print(f"plans solved: {solved:.1%}, plans that exceed a limit: {run.fallback.mea
 print(f"worst violation: {run.violation.max():.1e} in the unit of its limit (rad or rad/s)")
 print(f"largest torque as a fraction of its limit: {np.max(np.abs(run.inputs) / torque):.3f}")
 print(f"largest position error after {T * robot.dt:.1f} s: {error:.1e} rad")
-assert run.violation.max() < 1e-4
-assert np.all(np.abs(run.inputs) <= torque * (1 + 1e-5))
+assert run.violation.max() < 1e-4, "No loop leaves a limit of the state."
+assert np.all(np.abs(run.inputs) <= torque * (1 + 1e-5)), "No torque is beyond its limit."
 
 # %%
 time = robot.dt * np.arange(T + 1)
@@ -130,7 +131,7 @@ with_torque = np.linalg.norm(run.states[:, -1, :2] - x_goal[:, :2], axis=1)
 print(
     f"error at the end, worst: {with_torque.max():.1e} rad with u_ref, {offset.max():.1e} without"
 )
-assert offset.max() > 2 * with_torque.max()
+assert offset.max() > 2 * with_torque.max(), "Without the torque the arms settle elsewhere."
 
 # %%
 fig, axis = plt.subplots(figsize=(6, 3.5))
@@ -169,7 +170,7 @@ S = np.hstack([np.eye(2), np.zeros((2, 2))])
 G, g = np.vstack([S, -S]), np.concatenate([q_max, -q_min])
 slack = g - run.states @ G.T
 print(f"smallest distance of any state from a position limit: {slack.min():.3f} rad")
-assert np.all(slack >= 0)
+assert np.all(slack >= 0), "All states keep the position limits."
 
 # %% [markdown]
 # **Answer 2.**
@@ -187,4 +188,4 @@ print(
 # %%
 drawn = jm.closed_loop.randomised(robot, count, mass=(0.8, 1.2))
 print({name: np.shape(value) for name, value in drawn.items()})
-assert all(len(value) == count for value in drawn.values())
+assert all(len(value) == count for value in drawn.values()), "Each robot has its own masses."

@@ -72,7 +72,8 @@ batch = jax.vmap(controller.plan)
 x0s = states(1024)
 many, seconds_many = timed(batch, x0s.astype(np.float32))
 print(count_status(many.status), f"{1e6 * seconds_many / len(x0s):,.1f} µs a state")
-assert int(one.status) == jm.Status.SOLVED and "PRIMAL_INFEASIBLE" in count_status(many.status)
+assert int(one.status) == jm.Status.SOLVED, "There is a plan from the one state."
+assert "PRIMAL_INFEASIBLE" in count_status(many.status), "Some of the many have none."
 
 # %% [markdown]
 # ## `solve_many`
@@ -88,7 +89,7 @@ for size in sizes:
     rate.append(size / seconds)
     print(f"{size:>7,} states: {rate[-1]:>10,.0f} plans a second", count_status(plans.status))
 solved = plans.solved
-assert np.max(plans.primal_residual[solved]) < 1e-5
+assert np.max(plans.primal_residual[solved]) < 1e-5, "What is solved has small residuals."
 
 # %%
 fig, axis = plt.subplots(figsize=(6, 3.5))
@@ -117,9 +118,11 @@ counts = fmap.counts()
 print(f"{len(points):,} states in {seconds:.1f} s, compiling included:", counts)
 cell = 3.2 * 4.2 / 1023**2
 print(f"area by counting: {counts['feasible'] * cell:.4f}; exact: {1489 / 125} rad·rad/s")
-assert len(points) > 1e6
-assert counts["feasible"] + counts["infeasible"] + counts["undecided"] == len(points)
-assert abs(counts["feasible"] * cell - 1489 / 125) < 0.05
+assert len(points) > 1e6, "More than a million states."
+assert counts["feasible"] + counts["infeasible"] + counts["undecided"] == len(points), (
+    "All of them."
+)
+assert abs(counts["feasible"] * cell - 1489 / 125) < 0.05, "Counting gives the exact area."
 
 # %%
 fig, axis = plt.subplots(figsize=(6, 3.5))
@@ -150,8 +153,8 @@ reference = jm.solve_many(mpc, x0s)
 print("50 ADMM steps:   ", count_status(short.status))
 print("with Newton steps:", count_status(reference.status))
 open_ = np.mean(np.asarray(short.status) == jm.Status.ITERATION_LIMIT)
-assert open_ > 0.3
-assert np.mean(reference.status == jm.Status.ITERATION_LIMIT) < 0.01
+assert open_ > 0.3, "ADMM alone leaves many open."
+assert np.mean(reference.status == jm.Status.ITERATION_LIMIT) < 0.01, "Newton steps end them."
 
 # %% [markdown]
 # Nothing is broken: ADMM converges linearly and slowly where limits are active, and a status is
@@ -173,7 +176,8 @@ print(f"{both.sum()} states; error of the first torque: median {np.median(error)
       f"worst {error.max():.1e} N m")  # fmt: skip
 different = np.sum(np.asarray(many.status) != reference.status)
 print(f"states with another status than in float64: {different}")
-assert many.inputs.dtype == np.float32 and reference.inputs.dtype == np.float64
+assert many.inputs.dtype == np.float32, "Plans of JAX's usual type are float32."
+assert reference.inputs.dtype == np.float64, "solve_many answers in float64."
 
 # %%
 fig, axis = plt.subplots(figsize=(6, 3.5))
@@ -198,8 +202,8 @@ broken = x0s.copy()
 broken[7] = np.nan
 answer = jm.solve_many(mpc, broken)
 others = np.arange(len(x0s)) != 7
-assert answer.status[7] == jm.Status.NON_FINITE
-assert np.array_equal(answer.status[others], reference.status[others])
+assert answer.status[7] == jm.Status.NON_FINITE, "The state has a status of its own."
+assert np.array_equal(answer.status[others], reference.status[others]), "The others do not notice."
 print(jm.Status(int(answer.status[7])).sentence)
 
 # %% [markdown]
@@ -210,7 +214,8 @@ brake = np.clip(-x0s[:, 1:] / 0.2, -2.0, 2.0)
 found = reference.solved[:, None]
 u = np.where(found, reference.inputs[:, 0], brake)
 print(f"{np.sum(~found)} of {len(u)} states brake")
-assert np.all(np.isfinite(u)) and np.abs(u).max() <= 2.0 + 1e-6
+assert np.all(np.isfinite(u)), "Every state has an input."
+assert np.abs(u).max() <= 2.0 + 1e-6, "Within its limits."
 
 # %% [markdown]
 # **Answer 3.** They are in two corners: near the upper stop with a positive velocity, and near the
@@ -220,5 +225,6 @@ assert np.all(np.isfinite(u)) and np.abs(u).max() <= 2.0 + 1e-6
 within = np.all(np.abs(points) <= [1.5, 2.0], axis=1)
 doomed = points[within & (fmap.label == -1)]
 print(f"{len(doomed):,} of {within.sum():,} points within the limits have no plan")
-assert len(doomed) > 0 and np.all(doomed[:, 0] * doomed[:, 1] > 0)
-assert np.abs(doomed[:, 0]).min() > 1.3
+assert len(doomed) > 0, "There are such points."
+assert np.all(doomed[:, 0] * doomed[:, 1] > 0), "They move towards the stop."
+assert np.abs(doomed[:, 0]).min() > 1.3, "They are near it."

@@ -14,6 +14,9 @@ from jaxmpc.qp.linalg import matmul
 from jaxmpc.sets.convex_sets import Box, Polytope
 from jaxmpc.sets.limits import row_violations
 
+# Names of the terms, in the order in which they are told.
+TERMS = ("tracking", "effort", "violation", "settling")
+
 
 @record
 class ClosedLoopLoss:

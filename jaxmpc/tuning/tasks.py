@@ -32,7 +32,7 @@ from jaxmpc.sets.convex_sets import Box, Polytope
 from jaxmpc.sets.limits import TOLERANCE, rows_kept
 from jaxmpc.sets.lp import Program
 from jaxmpc.systems.riccati import lqr
-from jaxmpc.tuning.losses import ClosedLoopLoss
+from jaxmpc.tuning.losses import TERMS, ClosedLoopLoss
 from jaxmpc.tuning.parameters import Parameter, is_diagonal
 from jaxmpc.tuning.result import TuningRun
 from jaxmpc.tuning.weights import SOLVER, tune_weights
@@ -108,8 +108,10 @@ class WeightTask:
     def terms(self, run: Run) -> dict[str, float]:
         """Return the mean over the loops of each term of the loss."""
         with jax.enable_x64(self.dtype == "float64"):
-            each = jax.jit(jax.vmap(self.loss.terms))(jax.tree.map(jnp.asarray, run))
-        return {name: float(np.mean(term)) for name, term in each.items()}
+            given = jax.tree.map(jnp.asarray, run)
+            each = jax.tree.map(np.asarray, jax.jit(jax.vmap(self.loss.terms))(given))
+        # The program has them in the order of the alphabet.
+        return {name: float(np.mean(each[name])) for name in TERMS if name in each}
 
     def counts(self, run: Run, tolerance: float) -> dict[str, float]:
         """Return fractions of loops and plans from states and inputs alone: violated, unsolved,

@@ -1,6 +1,7 @@
 """Learning tasks from Python: what the command tunes, with the same functions."""
 
 import json
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -8,6 +9,7 @@ import problems
 import pytest
 
 import jaxmpc as jm
+from jaxmpc.closed_loop.simulation import Run
 from jaxmpc.tuning.result import CHECKPOINT, run_folder
 from jaxmpc.tuning.tasks import TIGHTEST, initial_range, weight_loss
 
@@ -96,3 +98,21 @@ def test_a_task_is_tuned_simulated_and_counted():
     assert run.settings["validation"] == task.validation == 2
     counts = task.counts(task.simulate(lambda: run.mpc), 0.02)
     assert counts["loops"] == 2 and counts["plans"] == 6 and counts["violated"] == 0
+
+
+def test_terms_of_a_loss_add_up_and_warn_of_nothing():
+    """The mean of each over float64 loops, from outside of float64 mode, in the order of TERMS."""
+    limits = jm.Box([-1.0, -1.0], [1.0, 1.0])
+    system = jm.LinearSystem([[1.0, 0.1], [0.0, 1.0]], [[0.0], [0.1]], dt=0.1)
+    mpc = jm.MPC(system, np.eye(2), 0.1, 3, limits, jm.Box(-1, 1))
+    task = jm.tuning.linear_task(
+        mpc, jm.tuning.weight_parameters(mpc), np.eye(2), settling=2.0, steps=2
+    )
+    states = np.array([[[2.0, 0.0], [0.0, 0.0], [0.0, 0.0]], [[0.0, 0.0]] * 3])
+    none = np.zeros((2, 2))
+    run = Run(states, np.ones((2, 2, 1)), *([none] * 6))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        terms = task.terms(run)
+    assert list(terms) == ["tracking", "effort", "violation", "settling"]
+    np.testing.assert_allclose(list(terms.values()), [1.0, 0.1, 10 * 0.25, 0.0], atol=1e-3)
