@@ -171,7 +171,7 @@ fig.tight_layout()
 # what it returns is never worse on the validation states than the solver that it is compared with.
 # Its numbers are not those of the picture: it measures on states set apart for validation, and its
 # residual is the largest of three, the duality gap too, which the picture leaves out. That one, in
-# units of cost, is far larger than the other two here.
+# units of cost, is the largest here.
 
 # %%
 penalties = jm.tuning.tune_solver(run.mpc, states, iterations=48, updates=30, batch=16)

@@ -307,6 +307,16 @@ def test_no_panel_of_tuning_is_empty(steps, every):
                 assert ("weight relative to the start" in names) == (steps > 0)
 
 
+def test_weights_that_move_alike_stay_in_sight():
+    """Each later line is thinner than those that it may lie on, and dashed in another way."""
+    trace = {"Q": dict.fromkeys(("p", "v", "w"), np.linspace(1, 2, 8)), "R": {"": np.ones(8)}}
+    history = drawn_history(np.random.default_rng(0), 7, 1, 0.0, zero=True)
+    axes = {ax.get_ylabel(): ax for ax in plot_tuning(history, trace, "title").axes}
+    lines = axes["weight relative to the start"].lines[:4]
+    assert np.all(np.diff([line.get_linewidth() for line in lines]) < 0)
+    assert len({str(line._dash_pattern) for line in lines}) == 4
+
+
 @pytest.mark.parametrize("residual", [1e-9, 1.0, np.inf, np.nan])
 @pytest.mark.parametrize("count", [1, 5])
 def test_no_panel_of_the_solver_is_empty(residual, count):

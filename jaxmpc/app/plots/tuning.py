@@ -157,9 +157,13 @@ def _draw_weights(
             colour = COLOURS[(i if count <= NAMED else g) % NAMED]
             ratios.append(values / values[0])
             alpha = 1 if count <= NAMED else 0.6
-            _line(ax, steps, ratios[-1], color=colour, lw=1.3, alpha=alpha)
-            if count <= NAMED:
-                handles.append(Line2D([], [], color=colour, label=f"{group} {name}".strip()))
+            # Later lines are thinner and dashed: those that they lie on stay in sight.
+            few = count <= NAMED
+            dashes, width = (DASHES[i % len(DASHES)], 2.6 - 1.4 * i / count) if few else ("-", 1.3)
+            _line(ax, steps, ratios[-1], color=colour, ls=dashes, lw=width, alpha=alpha)
+            if few:
+                label = f"{group} {name}".strip()
+                handles.append(Line2D([], [], color=colour, ls=dashes, lw=width, label=label))
             i += 1
         if count > NAMED:
             colour = COLOURS[g % NAMED]
