@@ -53,7 +53,8 @@ law = jm.lqr(system, Q, R)
 # %%
 alone = jm.sets.minimal_robust_invariant_set(system, law.K, load, 1e-2, disturbance_matrix=E)
 print(alone.bounding_box())
-assert np.all(np.asarray(alone.bounding_box().upper) < [0.15, 1.0])
+reach = np.asarray(alone.bounding_box().upper)
+assert np.all(reach < [0.15, 1.0]), "At most a tenth and a half of the way to the limits."
 
 # %% [markdown]
 # ## A nominal controller breaks a limit
@@ -93,8 +94,9 @@ with jax.enable_x64(True):
 for name, run in runs.items():
     solved = np.mean(run.status == jm.Status.SOLVED)
     print(f"{name}: largest violation {run.violation.max():.4f}, plans solved {solved:.2%}")
-assert runs["robust"].violation.max() < 1e-6
-assert np.all(runs["robust"].status == jm.Status.SOLVED)
+assert runs["nominal"].violation.max() > 1e-3, "The nominal controller breaks a limit."
+assert runs["robust"].violation.max() < 1e-6, "The robust one keeps all."
+assert np.all(runs["robust"].status == jm.Status.SOLVED), "It always has a plan."
 
 # %%
 figure, axes = plt.subplots(1, 2, figsize=(9, 3.5), sharey=True)
@@ -114,7 +116,8 @@ figure.tight_layout()
 # %%
 report = jm.recursive_feasibility(robust)
 print(report.strong)
-assert report.strong.holds
+assert report.strong.holds, "It is proved."
+assert "factor is at most 1" in report.strong.reason, "In rational arithmetic too."
 
 # %% [markdown]
 # ## How much larger could the set be?
@@ -130,7 +133,8 @@ for policy in ("tightened", "affine"):
     ).volume()
 areas["no load"] = jm.feasible.feasible_polytope(replace(nominal, horizon=6)).volume()
 print(areas)
-assert areas["tightened"] <= areas["affine"] <= areas["no load"]
+assert areas["tightened"] <= areas["affine"], "Affine policies answer to more."
+assert areas["affine"] <= areas["no load"], "The load takes something away."
 
 # %% [markdown]
 # ## On the controller's own processor

@@ -1,5 +1,6 @@
 """The notebooks run from their sources, and what is stored beside these was made from them."""
 
+import ast
 import json
 import os
 import subprocess
@@ -27,6 +28,13 @@ def test_stored_notebook(path):
     for cell in code:
         assert "".join(cell["source"]) in text
         assert not [out for out in cell["outputs"] if out["output_type"] == "error"]
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: path.stem)
+def test_asserts_say_which_sentence_no_longer_holds(path):
+    nodes = ast.walk(ast.parse(path.read_text()))
+    bare = [node.lineno for node in nodes if isinstance(node, ast.Assert) and node.msg is None]
+    assert not bare, f"lines without a sentence: {bare}"
 
 
 @pytest.mark.slow

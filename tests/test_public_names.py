@@ -209,3 +209,14 @@ def test_dir_lists_public_names_alone():
 def test_a_wrong_kind_is_told_a_name_that_exists():
     with pytest.raises(ValueError, match=r"critical_regions\(mpc\)"):
         jm.export.export_explicit_c(jm.MPC(jm.LinearSystem([[1]], [[1]]), 1, 1, 2), "law")
+
+
+def test_signatures_can_be_read():
+    """Arguments that take numbers, arrays or lists show one word for these, as in `help`."""
+    for name, found in public().items():
+        try:
+            text = str(inspect.signature(found))
+        except (TypeError, ValueError):  # modules, and what is no callable
+            continue
+        assert "numpy.bool" not in text, f"{name}{text}"
+    assert "x0: jaxmpc.arrays.Reals," in str(inspect.signature(jm.solve))

@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.typing import ArrayLike, DTypeLike
+from jax.typing import DTypeLike
 
 from jaxmpc.arrays import Reals, all_finite
 from jaxmpc.checks import fail, require_kind
@@ -81,7 +81,7 @@ def solve_stagewise(
     *,
     input_reference: Reals | None = None,
     previous_input: Reals | None = None,
-    scale: ArrayLike | None = None,
+    scale: Reals | None = None,
 ) -> Plan:
     """Solve an MPC problem stage by stage from the state x0 (n,): what takes the least time where
     the system is another one in each problem, or at each step.
@@ -113,9 +113,7 @@ def solve_stagewise(
     return plan_stages(factor, mpc, x0, reference, solver, warm_start, **aim)
 
 
-def factor_stages(
-    mpc: MPC, solver: ADMM = DEFAULT, scale: ArrayLike | None = None
-) -> "StageFactor":
+def factor_stages(mpc: MPC, solver: ADMM = DEFAULT, scale: Reals | None = None) -> "StageFactor":
     """What x0, references and warm start do not change: row scale and Riccati gains.
 
     Arguments and errors as in `solve_stagewise`; `plan_stages` does the rest.

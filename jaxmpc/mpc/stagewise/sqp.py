@@ -25,7 +25,7 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jax.typing import ArrayLike, DTypeLike
+from jax.typing import DTypeLike
 
 from jaxmpc.arrays import Reals, all_finite
 from jaxmpc.checks import fail, require_kind, whole
@@ -89,7 +89,7 @@ def solve_nonlinear(
     targets: Sequence[Reals | None] | None = None,
     iterations: int = ITERATIONS,
     hessian: Literal["exact", "gauss-newton"] = "exact",
-    scale: ArrayLike | None = None,
+    scale: Reals | None = None,
 ) -> Plan:
     """Solve a nonlinear MPC from the state x0 (n,) by sequential quadratic programming.
 
