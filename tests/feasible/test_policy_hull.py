@@ -369,3 +369,17 @@ def test_policies_in_units_of_the_disturbances():
         assert np.max(x @ H.T - h) <= 1e-9
     with pytest.raises(ValueError, match="has no affine policy"):
         affine_policies(double(policy="tightened"), points)
+
+
+def test_a_tube_whose_disturbance_has_one_direction():
+    """The section has dozens of generators, the last of them 1e-12 long: none is a limit."""
+    mpc = double(
+        policy="tube", gain=None, terminal_set=None, horizon=3,
+        disturbance=jm.Box([-0.1], [0.1]), disturbance_matrix=np.array([[0.5], [1.0]]),
+    )  # fmt: skip
+    points = jm.grid([-1.0, -0.5], [1.0, 0.5], 3)
+    plans = jm.solve_many(mpc, points)
+    labels = jm.map_feasible_set(mpc, points)
+    assert (np.asarray(plans.status) == jm.Status.SOLVED).all()
+    assert (labels.label == 1).all()
+    assert feasible_polytope(mpc).contains(points).all()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxmpc.sets import lp
-from jaxmpc.sets.lp import Model, Program
+from jaxmpc.sets.lp import Model, Program, scaling
 
 
 def test_bound_is_valid_for_inexact_multipliers():
@@ -74,3 +74,15 @@ def test_no_answer_is_better_than_one_outside_the_rows(monkeypatch):
     monkeypatch.setattr(Program, "_by_dual", lambda *_: None)
     with pytest.raises(ValueError, match="no answer that can be checked"):
         program.maximise(np.array([1.0, 2.0]))
+
+
+def test_variables_within_bounds_of_their_own_count_in_these_units():
+    """|ζ_i| ≤ 1 beside sixty rows in which ζ has entries of 1e-10: the smaller rows must not make
+    1e10 the unit of ζ, in which the bounds are closer than any margin that can be told from 0."""
+    random = np.random.default_rng(0)
+    rows = np.hstack([random.normal(size=(60, 2)), 1e-10 * random.normal(size=(60, 3))])
+    box = np.hstack([np.zeros((3, 2)), np.eye(3)])
+    G, g = np.vstack([rows, -rows, box, -box]), np.ones(126)
+    _, column = scaling(G, g)
+    assert (column[2:] <= 2).all()
+    assert Program(G, g).margin()[1] > 0.1
