@@ -371,6 +371,7 @@ def test_policies_in_units_of_the_disturbances():
         affine_policies(double(policy="tightened"), points)
 
 
+@pytest.mark.slow
 def test_a_tube_whose_disturbance_has_one_direction():
     """The section has dozens of generators, the last of them 1e-12 long: none is a limit."""
     mpc = double(
