@@ -205,12 +205,18 @@ def require_box(mpc: MPC, lower: Any, upper: Any) -> None:
         require_finite(argument, bound)
 
 
+@jax.jit  # compiled once for all controllers of a problem
+def _statuses(controller: Controller, states: Any) -> Any:
+    """Return the statuses (B,) of the plans from states (B, n)."""
+    return jax.vmap(lambda x: controller(x).plan.status)(states)
+
+
 def starting_states(
     controller: Controller, lower: np.ndarray, upper: np.ndarray, seed: int
 ) -> np.ndarray:
     """Return random states (`LOOPS`, n) of a box, such that have a plan where there are some."""
     starts = np.random.default_rng(seed).uniform(lower, upper, (50 * LOOPS, len(lower)))
-    status = jax.jit(jax.vmap(lambda x: controller(x).plan.status))(starts)
+    status = _statuses(controller, starts)
     return starts[np.argsort(np.asarray(status) != Status.SOLVED, kind="stable")[:LOOPS]]
 
 

@@ -141,5 +141,8 @@ def alike(a: Any, b: Any) -> bool:
 
 def _extremes(found: Verification) -> list[tuple[str, str]]:
     """Return the rows of the least margin and the least excess, where there are any."""
-    values = {"least margin": found.margin, "least excess": found.excess}
-    return [(name, f"{value:.3g}") for name, value in values.items() if value < float("inf")]
+    rows = [
+        ("least margin", found.margin, "of a plan to a limit, in the unit of that"),
+        ("least excess", found.excess, "of an infeasible state beyond its half-space"),
+    ]
+    return [(name, f"{value:.3g}  {what}") for name, value, what in rows if value < float("inf")]
