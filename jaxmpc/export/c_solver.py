@@ -28,6 +28,8 @@ from jaxmpc.qp.status import Status
 TOLERANCE = {"float64": 1e-6, "float32": 1e-3}
 # Closed loops of `check_fixed_steps`.
 LOOPS = 20
+# States that are drawn to find their starts, and at which plans are made at once.
+DRAWN = 50 * LOOPS
 
 
 def export_c(
@@ -206,18 +208,33 @@ def require_box(mpc: MPC, lower: Any, upper: Any) -> None:
 
 
 @jax.jit  # compiled once for all controllers of a problem
-def _statuses(controller: Controller, states: Any) -> Any:
-    """Return the statuses (B,) of the plans from states (B, n)."""
-    return jax.vmap(lambda x: controller(x).plan.status)(states)
+def _controls(controller: Controller, states: Any, before: Any) -> Any:
+    """Return inputs (B, m) and statuses (B,) of plans from states (B, n) after inputs (B, m)."""
+    found = jax.vmap(lambda x, u: controller(x, previous_input=u))(states, before)
+    return found.u, found.plan.status
+
+
+def _precise_plans(
+    controller: Controller, states: np.ndarray, before: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return `_controls` in parts of one shape, the last one filled up with its last state."""
+    parts = []
+    for i in range(0, len(states), DRAWN):
+        part = np.arange(i, i + DRAWN).clip(max=len(states) - 1)
+        parts.append(_controls(controller, states[part], before[part]))
+    u, status = (
+        np.concatenate([np.asarray(v) for v in column]) for column in zip(*parts, strict=True)
+    )
+    return u[: len(states)], status[: len(states)]
 
 
 def starting_states(
     controller: Controller, lower: np.ndarray, upper: np.ndarray, seed: int
 ) -> np.ndarray:
     """Return random states (`LOOPS`, n) of a box, such that have a plan where there are some."""
-    starts = np.random.default_rng(seed).uniform(lower, upper, (50 * LOOPS, len(lower)))
-    status = _statuses(controller, starts)
-    return starts[np.argsort(np.asarray(status) != Status.SOLVED, kind="stable")[:LOOPS]]
+    starts = np.random.default_rng(seed).uniform(lower, upper, (DRAWN, len(lower)))
+    _, status = _precise_plans(controller, starts, np.zeros((DRAWN, controller.mpc.system.m)))
+    return starts[np.argsort(status != Status.SOLVED, kind="stable")[:LOOPS]]
 
 
 def check_fixed_steps(
@@ -254,19 +271,18 @@ def check_fixed_steps(
         drift = 0.0 if mpc.system.c is None else jnp.asarray(host_array("system.c", mpc.system.c))
 
         def step(state: Any, _: Any) -> Any:
-            x, before, best_before = state
-            control, best = fixed(x, before), precise(x, best_before)
+            x, before = state
+            control = fixed(x, before)
             after = matmul(A, x) + matmul(B, control.u) + drift
-            error = jnp.max(jnp.abs(control.u - best.u))
-            # The previous input of the next time step is what was applied.
-            carried = after, control, best._replace(u=control.u)
-            return carried, (control.plan.status, best.plan.status, error)
+            return (after, control), (x, before.u, control.u, control.plan.status)
 
         def loop(x: Any) -> Any:
-            start = x, fixed.start(x), precise.start(x)
-            return jax.lax.scan(step, start, length=-(-plans // LOOPS))[1]
+            return jax.lax.scan(step, (x, fixed.start(x)), length=-(-plans // LOOPS))[1]
 
-        status, best, error = (np.asarray(v) for v in jax.jit(jax.vmap(loop))(starts))
+        loops = (np.asarray(v) for v in jax.jit(jax.vmap(loop))(starts))
+        x, before, u, status = (v.reshape(-1, *v.shape[2:]) for v in loops)
+        best_u, best = _precise_plans(precise, x, before)
+        error = np.abs(u - best_u).max(axis=1)
     solvable = best == Status.SOLVED
     both = solvable & (status == Status.SOLVED)
     return ClosedLoopCheck(
