@@ -301,7 +301,7 @@ def test_soft_and_hard_limits_that_vary_are_each_others():
         (
             {"stage_weights": [0, 1, 1, 1, 1], "input_rate_weight": None,
              "system": jm.LinearSystem(np.eye(n), np.zeros((n, m)))},
-            "R: .*at k = 0",
+            "stage_weights: is 0 at k = 0",
         ),
         ({"disturbance": jm.Box(-0.1, 0.1)}, "system.A: differs from step to step, and policies"),
     ],
