@@ -326,13 +326,13 @@ def scaling(G: np.ndarray, g: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return powers of two (row, column) with row_i G_ij column_j and row_i g_i of about 1.
 
     column_j is how far along x_j the rows that it dominates let a point go, |g_i| / |G_ij|, in the
-    median, but no farther than the farther of its own two bounds. A row is dominated by the entries
-    within a factor of 16 of its largest in scaled columns. So entries of G that are rounding have
-    no influence (`_rounding_entries`), nor have distances 1e12 times smaller or larger than most,
-    which are rounding or no limits. This starts from the least squares fit of the logarithms of
-    [G, g] (Curtis & Reid 1972, J. Inst. Maths Applics 10). Rows follow: their largest entry is
-    about 1. A change of units of rows and columns
-    changes the answer by the same factors.
+    median, or the farther of its own two bounds where that is a thousand times less. A row is
+    dominated by the entries within a factor of 16 of its largest in scaled columns. So entries of G
+    that are rounding have no influence (`_rounding_entries`), nor have distances 1e12 times smaller
+    or larger than most, which are rounding or no limits. This starts from the least squares fit of
+    the logarithms of [G, g] (Curtis & Reid 1972, J. Inst. Maths Applics 10). Rows follow: their
+    largest entry is about 1. A change of units of rows and columns changes the answer
+    by the same factors.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         every, distance = np.log2(np.abs(G)), np.log2(np.abs(g))
@@ -365,7 +365,8 @@ def scaling(G: np.ndarray, g: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         ruled = usable[:, None] & (T >= np.where(usable, top, np.inf)[:, None] - 4)
         count = ruled.sum(axis=0)
         middle = np.sort(np.where(ruled, reach, np.inf), axis=0)[np.maximum(count - 1, 0) // 2]
-        column = np.minimum(np.where(count > 0, np.diagonal(middle), column), bound)
+        column = np.where(count > 0, np.diagonal(middle), column)
+        column = np.where(column > bound + 10, bound, column)
     column = np.round(column)
     top = (every + column).max(axis=1, initial=-np.inf)
     top = np.where(np.isfinite(top), top, np.where(np.isfinite(distance), distance, 0.0))

@@ -171,7 +171,10 @@ def test_bad_environments_are_named(environment):
     mpc = jm.MPC(jm.LinearSystem(np.eye(2), np.ones((2, 1))), np.eye(2), np.eye(1), 2)
     policy = environment.policy(LinearFeedback(mpc, [[-1.0, -1.0]], robot))
     for call, message in (
-        (lambda: Environment.of(None), "robot: is a NoneType. Give a jm.Robot or LinearPlant"),
+        (
+            lambda: Environment.of(None),
+            "robot: is a NoneType. Give a jm.robots.Robot or jm.LinearPlant",
+        ),
         (lambda: Environment.of(robot, length=0), "length: 0"),
         (lambda: Environment.of(robot, spread=-1.0), "spread: -1.0. Give a fraction"),
         (lambda: Environment.of(robot, Q=[1.0, 1.0, 1.0], R=[1.0]), "Q: shape"),

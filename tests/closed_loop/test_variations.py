@@ -85,5 +85,5 @@ def test_bad_ranges_are_named(arm):
             randomised(arm, 3, **given)
     with pytest.raises(ValueError, match="count: 0"):
         randomised(arm, 0, mass=(0.9, 1.1))
-    with pytest.raises(ValueError, match="robot: is a LinearSystem. Give a jm.Robot"):
+    with pytest.raises(ValueError, match="robot: is a LinearSystem. Give a jm.robots.Robot"):
         randomised(jm.LinearSystem([[1.0]], [[1.0]]), 3, mass=(0.9, 1.1))

@@ -454,7 +454,8 @@ def test_home_off_the_couplings():
     _, robot, said = loaded(parts)
     assert not said
     with pytest.raises(
-        ValueError, match="q: .* violates couplings .equalities. of the file by 0.5"
+        ValueError,
+        match="q: .* violates couplings .equalities. of the file: equality e is off by 0.5",
     ):
         robot.equilibrium()
     x, _ = robot.set_point()
