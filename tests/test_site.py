@@ -35,7 +35,7 @@ def test_a_notebook_as_a_page(hooks):
     """Its title, its code, each picture once, and what it prints as text."""
     path = DOCS.parent / "notebooks" / "00_first_plan.ipynb"
     text, pictures = hooks.page_of(path)
-    assert text.startswith("# A first plan\n") and "Download this notebook" in text
+    assert text.startswith("# 0. A first plan\n") and "Download this notebook" in text
     assert len(pictures) == text.count("![Picture") == 2
     assert all(data.startswith(b"\x89PNG") for data in pictures.values())
     assert text.count("```python") > 5 and '<pre class="output">' in text

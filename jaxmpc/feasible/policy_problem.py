@@ -240,7 +240,7 @@ def tube_fractions(mpc: MPC, view: Any) -> PolicyRows:
     whole = condensed_fractions(mpc, make_view(mpc), 0 * center, zeros(n, 0)).F
     found = [(b, k) for b in hard_blocks(without_disturbance(mpc)) for k in b.steps]
     held = np.repeat([b.kind == "previous input" for b, _ in found], [b.size for b, _ in found])
-    whole = np.where(held[:, None], Fraction(0), whole)  # u_{−1} itself is limited
+    whole = np.where(held[:, None], np.array(Fraction(0), object), whole)  # u_{−1} is limited
     if mpc.rate_limited:
         whole = whole[:, :n] + whole[:, n:] @ K
     G = np.hstack([nominal.G, -(whole @ sides)])

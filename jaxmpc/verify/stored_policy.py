@@ -152,8 +152,8 @@ def first_rates(
     rounded, and the two pairs of bounds less the rest of it, rounded inwards and outwards."""
     K, E = fractions(described["gain"]), np.shape(described["E"])
     center, G = (fractions(described["section"][name]) for name in ("center", "generators"))
-    rates = H[:, E[0] :].any(axis=1) & D.any(axis=1)
-    along = np.where(rates[:, None], fractions(D), Fraction(0)) @ K
+    rates: Any = H[:, E[0] :].any(axis=1) & D.any(axis=1)
+    along = np.where(rates[:, None], fractions(D), np.array(Fraction(0), object)) @ K
     exact, middle = along @ G, along @ center
     near = exact.astype(float)
     off = abs(exact - fractions(near)).sum(axis=1) if exact.size else 0 * middle

@@ -24,7 +24,7 @@ import numpy as np
 from jax import Array
 from jax.typing import DTypeLike
 
-from jaxmpc.arrays import Reals, all_finite
+from jaxmpc.arrays import Reals, all_finite, as_array
 from jaxmpc.checks import fail, require_kind
 from jaxmpc.mpc.plan import Aim, Plan, WarmStart, answer, checked_aim
 from jaxmpc.mpc.problem import MPC
@@ -120,8 +120,9 @@ def factor_stages(mpc: MPC, solver: ADMM = DEFAULT, scale: Reals | None = None) 
     """
     mpc = checked(mpc, solver)
     rows = row_count(layout(mpc))
-    if scale is not None and np.shape(scale) != (rows,):
-        fail("scale", f"shape {np.shape(scale)}", f"Give ({rows},), one number a row")
+    shape = (rows,) if scale is None else np.shape(as_array(scale))
+    if shape != (rows,):
+        fail("scale", f"shape {shape}", f"Give ({rows},), one number a row")
     return _factor(*arrays((mpc, solver.rho, scale)), steps=solver.admm_steps() > 0)
 
 
