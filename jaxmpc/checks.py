@@ -117,9 +117,13 @@ def in_units(count: float) -> str:
 
 def concrete(*values: Any) -> bool:
     """Return True when no value is being traced, so that all can be read."""
+    # (Sets ask this of each of their arrays whenever JAX rebuilds them.)
+    others = [v for v in values if not isinstance(v, np.ndarray | np.generic | float | int)]
+    if not others:
+        return True
     import jax
 
-    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
+    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(others))
 
 
 def whole(argument: str, value: Any, least: int) -> int:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from jaxmpc.checks import fail, require_kind
+from jaxmpc.feasible.hard_constraints import augmented_dynamics
 from jaxmpc.feasible.plan_polytope import DIMENSIONS, FACETS, CenteredPolytope, projected
 from jaxmpc.feasible.policy_problem import problem_of
 from jaxmpc.mpc.plan import rate_ends
@@ -16,7 +17,7 @@ from jaxmpc.pytrees import record
 from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope
 from jaxmpc.sets.geometry import unit_rows
 from jaxmpc.sets.predecessors import predecessor
-from jaxmpc.systems.system import LinearSystem, host_matrices
+from jaxmpc.systems.system import LinearSystem
 
 # Why the facets of problems of many states with limited rates are not found, and what helps.
 RATES = (
@@ -91,13 +92,9 @@ def _any_policy_of_rates(mpc: MPC) -> Polytope:
     """Return the same for states (x, u_{−1}), whose input is the change Δ of u: x⁺ = A x + B u_{−1}
     + B Δ + c + E w, and u_{−1} + Δ is the next u_{−1}."""
     n, m = mpc.system.n, mpc.system.m
-    A, B, c = host_matrices(mpc.system)
-    system = LinearSystem(
-        np.block([[A, B], [np.zeros((m, n)), np.eye(m)]]),
-        np.vstack([B, np.eye(m)]),
-        c=np.append(c, np.zeros(m)),
-    )
     of_x, of_u = np.eye(n, n + m), np.eye(m, n + m, n)
+    A, B, c = augmented_dynamics(mpc)  # of the input u = u_{−1} + Δ
+    system = LinearSystem(A + B @ of_u, B, c=c)
 
     def lifted(body: Any, M: np.ndarray) -> Polytope:
         if body is None:

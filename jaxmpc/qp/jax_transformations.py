@@ -373,8 +373,8 @@ def _in_groups(
 
         return map_blocks(of_block, BLOCK, (own, state))
 
-    def while_more(least: Any, advance: Callable[[S], S], state: S, counts: Any = True) -> S:
-        more = lambda state: jnp.sum(open_ones(state) & counts) > least
+    def while_more(least: Any, advance: Callable[[S], S], state: S, real: Any = True) -> S:
+        more = lambda state: jnp.sum(open_ones(state) & real) > least
         return lax.while_loop(more, advance, state)
 
     def advance_group(leaves: tuple, count: int, least: int, state: S) -> S:

@@ -331,8 +331,8 @@ def scaling(G: np.ndarray, g: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     that are rounding have no influence (`_rounding_entries`), nor have distances 1e12 times smaller
     or larger than most, which are rounding or no limits. This starts from the least squares fit of
     the logarithms of [G, g] (Curtis & Reid 1972, J. Inst. Maths Applics 10). Rows follow: their
-    largest entry is about 1. A change of units of rows and columns changes the answer
-    by the same factors.
+    largest entry is about 1. A change of units of rows and columns changes the answer by the same
+    factors.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         every, distance = np.log2(np.abs(G)), np.log2(np.abs(g))

@@ -91,15 +91,23 @@ def tightened(
     """Return (lower, upper) of the rows of each step k = 0..N, rounded inwards, and the same
     rounded outwards. A, B: of the stored problem, whose state ends with u_{−1} where rates are
     limited."""
-    E, K = fractions(described["E"]), fractions(described["gain"])
+    E, K, closed = _closed_loop(described, A, B)
     n = len(E)
-    closed = fractions(A[:n, :n]) + fractions(B[:n]) @ K
     sums: dict[tuple[float, ...], list[tuple[Fraction, Fraction]]] = {}
     taken = [
         [_taken(described["set"], (*h, *d), k, n, E, K, closed, sums) for h, d in rows]
         for k, rows in enumerate(_each_row(H, D))
     ]
     return _both_ways(lower, upper, taken)
+
+
+def _closed_loop(
+    described: Mapping[str, Any], A: np.ndarray, B: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return E, K and A + B K of the states of the system, in Fractions."""
+    E, K = fractions(described["E"]), fractions(described["gain"])
+    n = len(E)
+    return E, K, fractions(A[:n, :n]) + fractions(B[:n]) @ K
 
 
 def tightened_by_section(
@@ -119,9 +127,8 @@ def taken_by_section(
     described: Mapping[str, Any], A: np.ndarray, B: np.ndarray, H: Steps, D: Steps
 ) -> list[list[tuple[Fraction, Fraction]]]:
     """Return what a tube takes from the lower and the upper bound of each row of each step."""
-    K, section, E = fractions(described["gain"]), described["section"], fractions(described["E"])
+    section, (E, K, closed) = described["section"], _closed_loop(described, A, B)
     n = len(E)
-    closed = fractions(A[:n, :n]) + fractions(B[:n]) @ K
     nothing: dict[str, list[float]] = {"lower": [0.0] * E.shape[1], "upper": [0.0] * E.shape[1]}
     taken = []
     for k, rows in enumerate(_each_row(H, D)):
