@@ -96,11 +96,11 @@ def test_donated_controller():
     """No array of it is another's, nor the user's."""
     Q = jnp.array([1.0, 0.5])
     mpc = problem(Q=Q)
+    step = jax.jit(lambda c, x: (c, c.plan(x).inputs), donate_argnums=0)
+    want = step(jm.Controller(problem()), X0)[1]
     controller = jm.Controller(mpc)
-    want = controller.plan(X0).inputs
     leaves = [v for v in jax.tree.leaves(controller) if v.size]
     assert len({v.unsafe_buffer_pointer() for v in leaves}) == len(leaves)
-    step = jax.jit(lambda c, x: (c, c.plan(x).inputs), donate_argnums=0)
     again, inputs = step(controller, X0)
     assert all(v.is_deleted() for v in leaves) and not mpc.Q.is_deleted()
     np.testing.assert_allclose(inputs, want, atol=1e-6)

@@ -35,7 +35,15 @@ from jaxmpc.qp.jax_transformations import (
     own_modes,
     varying,
 )
-from jaxmpc.qp.linalg import apply, arrays, by_step, floating_dtype, matmul, solve
+from jaxmpc.qp.linalg import (
+    apply,
+    arrays,
+    by_step,
+    floating_dtype,
+    matmul,
+    namespace,
+    solve,
+)
 from jaxmpc.qp.problem import QP, Bounds
 from jaxmpc.systems.riccati import lqr
 from jaxmpc.systems.system import LinearSystem, host_matrices
@@ -141,6 +149,12 @@ class Condensed:
 def _predicted(A: Array, w: Array, start: Array) -> Array:
     """Return x_0 … x_N of x⁺ = A_k x + w_k from x_0 = start, a vector or a matrix: A (n, n), or
     one a step, w (N, n, …)."""
+    xp = namespace((A, w, start))
+    if xp is np:
+        found = [start]
+        for own, push in zip(np.broadcast_to(A, (len(w), *A.shape[-2:])), w, strict=True):
+            found.append(own @ found[-1] + push)
+        return xp.array(found)
     each, at = by_step((A, 2))
 
     def move(x: Array, step: tuple) -> tuple[Array, Array]:
@@ -219,7 +233,10 @@ def condense(mpc: MPC) -> Condensed:
     mpc = filled_in(mpc)
     if mpc.disturbance is not None and concrete(mpc):
         require_room(mpc, blocks(mpc, float))
-    return _condense(arrays(mpc))
+    if concrete(mpc):
+        made = _condense(jax.tree.map(np.asarray, arrays(mpc)))
+        return jax.tree.map(jnp.array, made)
+    return _condense_in_jax(arrays(mpc))
 
 
 def filled_in(mpc: MPC) -> MPC:
@@ -242,13 +259,15 @@ def in_float64(mpc: MPC) -> MPC:
     return jax.tree.map(np.float64, filled_in(mpc))
 
 
-@compiled_lightly(0)
-@own_modes
 def _condense(mpc: MPC) -> Condensed:
+    """`condense` of a problem of JAX's arrays, traced or not, or of NumPy's."""
     system, N = mpc.system, mpc.horizon
     n, m, p = system.n, system.m, mpc.dimension
     dtype = floating_dtype(replace(mpc, prestabilise=None))
-    cast = lambda v: jnp.asarray(v, dtype)
+    xp = namespace(mpc)
+    inverse_times: Any = solve if xp is jnp else np.linalg.solve
+    options: Any = {"precision": "highest"} if xp is jnp else {"optimize": True}
+    cast = lambda v: xp.asarray(v, dtype)
     weights = Q, R, P_N, W = weights_of(mpc, dtype)
     A, B, c = dynamics_of(system, dtype)
     K = cast(mpc.prestabilise)
@@ -258,25 +277,25 @@ def _condense(mpc: MPC) -> Condensed:
     E = cast(np.kron(places, np.eye(m)).reshape(N, m, -1))
     nz = E.shape[2]
     pushes = cast(places)[:, None, :, None] * B[..., None, :]
-    drift = jnp.broadcast_to(c, (N, n))[..., None]
-    w = [pushes.reshape(N, n, nz), jnp.zeros((N, n, p), dtype), drift]
+    drift = xp.broadcast_to(c, (N, n))[..., None]
+    w = [pushes.reshape(N, n, nz), xp.zeros((N, n, p), dtype), drift]
     X = _predicted(
-        A + matmul(B, K), jnp.concatenate(w, axis=2), jnp.eye(n, nz + p + 1, nz, dtype=dtype)
+        A + matmul(B, K), xp.concatenate(w, axis=2), xp.eye(n, nz + p + 1, nz, dtype=dtype)
     )
     Gamma, Phi, phi = X[..., :nz], X[..., nz:-1], X[..., -1]
     Psi, Omega, psi = matmul(K, Phi[:N]), matmul(K, Gamma[:N]) + E, apply(K, phi[:N])
 
     # Δu_k = u_k − u_{k−1}, with u_{−1} the last m coordinates of θ.
-    previous = jnp.pad(jnp.eye(m, dtype=dtype), ((0, 0), (n, 0))) if p > n else jnp.zeros((m, p))
-    before = (jnp.zeros_like(Omega[0]), cast(previous), jnp.zeros_like(psi[0]))
+    previous = np.pad(np.eye(m), ((0, 0), (n, 0))) if p > n else np.zeros((m, p))
+    before = (xp.zeros_like(Omega[0]), cast(previous), xp.zeros_like(psi[0]))
     rates = tuple(
-        M - jnp.concatenate([M_0[None], M[:-1]])
+        M - xp.concatenate([M_0[None], M[:-1]])
         for M, M_0 in zip((Omega, Psi, psi), before, strict=True)
     )
 
-    of_states = jnp.concatenate([jnp.broadcast_to(Q, (N, n, n)), P_N[None]])
-    product = lambda M, weight, X: jnp.einsum(
-        f"kai,{'kab' if weight.ndim == 3 else 'ab'},kb...->i...", M, weight, X, precision="highest"
+    of_states = xp.concatenate([xp.broadcast_to(Q, (N, n, n)), P_N[None]])
+    product = lambda M, weight, X: xp.einsum(
+        f"kai,{'kab' if weight.ndim == 3 else 'ab'},kb...->i...", M, weight, X, **options
     )
     # 2 Σ_k M_k' W_k X_k with the weights of states, inputs and rates: the Hessian for X = Γ, the
     # part of the linear term in θ for X = Φ, its constant part for X = φ.
@@ -292,16 +311,16 @@ def _condense(mpc: MPC) -> Condensed:
     A_last, B_last, R_last = (M[-1] if M.ndim == 3 else M for M in (A, B, R))
     BtP = matmul(B_last.T, P_N)
     G = R_last + matmul(BtP, B_last)
-    ridge = 10 * jnp.finfo(dtype).eps * jnp.trace(G) / m
-    ridge = jnp.where(ridge > 0, ridge, 1.0)
-    K_N = -solve(G + ridge * jnp.eye(m, dtype=dtype), matmul(BtP, A_last))
+    ridge = 10 * xp.finfo(dtype).eps * xp.trace(G) / m
+    ridge = cast(xp.where(ridge > 0, ridge, 1.0))
+    K_N = -inverse_times(G + ridge * xp.eye(m, dtype=dtype), matmul(BtP, A_last))
 
     found = blocks(mpc, dtype)
     bounds = bounds_of(found, dtype)
     states, inputs = (Gamma, Phi, phi), (Omega, Psi, psi)
-    empty = (jnp.zeros((0, P.shape[0]), dtype), jnp.zeros((0, p), dtype), jnp.zeros(0, dtype))
+    empty = (xp.zeros((0, P.shape[0]), dtype), xp.zeros((0, p), dtype), xp.zeros(0, dtype))
     parts = [empty] + [stacked(b, states, rates if b.rate else inputs) for b in found]
-    C, D, d = (jnp.concatenate(part) for part in zip(*parts, strict=True))
+    C, D, d = (xp.concatenate(part) for part in zip(*parts, strict=True))
     return Condensed(
         Phi=Phi,
         Gamma=Gamma,
@@ -327,6 +346,9 @@ def _condense(mpc: MPC) -> Condensed:
         balls=bounds.balls,
         begins=tuple(int(k) for k in np.unique(mpc.moves, return_index=True)[1]),
     )
+
+
+_condense_in_jax = compiled_lightly(0)(own_modes(_condense))
 
 
 def condensed_in_float64(mpc: MPC) -> Condensed:

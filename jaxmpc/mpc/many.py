@@ -135,9 +135,11 @@ def solve_many(
             mpc = Controller(in_float64(mpc), solver)
         if x0s.shape[1] < p:
             x0s = np.pad(np.asarray(x0s), ((0, 0), (0, p - n)))
-        some = x0s if len(x0s) else np.zeros((1, p))  # and none of the plans from these
-        plans = Batch(mpc, some, chunk, to_host, chosen).solve(transfer)
-    return plans if len(x0s) else first_rows(plans, 0)
+        if not len(x0s):
+            shapes = jax.eval_shape(jax.vmap(mpc.plan), np.zeros((1, p)))
+            empty = lambda s: (np if to_host else jnp).zeros((0, *s.shape[1:]), s.dtype)
+            return jax.tree.map(empty, shapes)
+        return Batch(mpc, x0s, chunk, to_host, chosen).solve(transfer)
 
 
 class Batch:

@@ -28,7 +28,7 @@ from jaxmpc.checks import (
     require_symmetric_psd,
 )
 from jaxmpc.pytrees import named_pytree, pytree, static, static_pytree
-from jaxmpc.qp.linalg import apply, matmul, symmetric
+from jaxmpc.qp.linalg import apply, matmul, namespace, symmetric
 from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope
 from jaxmpc.sets.disturbances import require_disturbance
 from jaxmpc.sets.limits import output_limits
@@ -624,14 +624,17 @@ def weights_of(mpc: MPC, dtype: Any) -> Weights:
     would take it for curvature, but Q itself for linear terms.
     """
 
+    given = mpc.Q, mpc.R, mpc.terminal_cost, mpc.input_rate_weight, mpc.stage_weights
+    xp = namespace(given)
+
     def matrix(value: Reals | None, size: int) -> Array:
-        value = jnp.asarray(np.zeros(size) if value is None else value, dtype)
-        return symmetric(jnp.diag(value) if value.ndim == 1 else value)
+        M = xp.asarray(np.zeros(size) if value is None else value, dtype)
+        return symmetric(xp.diag(M) if M.ndim == 1 else M)
 
     n, m = mpc.system.n, mpc.system.m
     Q, R, P = matrix(mpc.Q, n), matrix(mpc.R, m), matrix(mpc.terminal_cost, n)
     if mpc.stage_weights is not None:
-        stage = jnp.asarray(mpc.stage_weights, dtype)[:, None, None]
+        stage = xp.asarray(mpc.stage_weights, dtype)[:, None, None]
         Q, R = stage * Q, stage * R
     return Weights(Q, R, P, matrix(mpc.input_rate_weight, m))
 
@@ -639,8 +642,9 @@ def weights_of(mpc: MPC, dtype: Any) -> Weights:
 def dynamics_of(system: LinearSystem, dtype: Any) -> tuple[Array, Array, Array]:
     """Return A, B and c, zero for None, in one floating type, each with a leading axis where it
     differs from step to step. Works inside jit, vmap and grad."""
-    A, B = jnp.asarray(system.A, dtype), jnp.asarray(system.B, dtype)
-    return A, B, jnp.zeros(system.n, dtype) if system.c is None else jnp.asarray(system.c, dtype)
+    xp = namespace((system.A, system.B, system.c))
+    A, B = xp.asarray(system.A, dtype), xp.asarray(system.B, dtype)
+    return A, B, xp.zeros(system.n, dtype) if system.c is None else xp.asarray(system.c, dtype)
 
 
 def _form(M: np.ndarray, size: np.ndarray) -> np.ndarray:

@@ -22,7 +22,7 @@ from jaxmpc.checks import require_kind
 from jaxmpc.mpc.problem import MPC, Outputs, Soft, output_stages, soft_stages
 from jaxmpc.mpc.tightening import tightened
 from jaxmpc.pytrees import pytree, record, static
-from jaxmpc.qp.linalg import apply, apply_transposed, cholesky, matmul
+from jaxmpc.qp.linalg import apply, apply_transposed, cholesky, matmul, namespace
 from jaxmpc.qp.problem import Bounds
 from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope
 
@@ -122,7 +122,7 @@ class Block(Rows):
         def tiled(v: Any) -> Any:
             if v is None or np.ndim(v) == 2:
                 return None if v is None else v.ravel()
-            return jnp.tile(v, len(self.steps))
+            return namespace(v).tile(v, len(self.steps))
 
         l, u, linear, quadratic = map(tiled, (self.lower, self.upper, self.linear, self.quadratic))
         if self.radius is None:
@@ -155,7 +155,8 @@ class Row:
 
 def blocks(mpc: MPC, dtype: DTypeLike) -> list[Block]:
     """Return the blocks of a problem, arrays in `dtype`; of a robust one those of the nominal
-    problem it stands for (`tightening.py`). Works inside jit, vmap and grad."""
+    problem it stands for (`tightening.py`). Works inside jit, vmap and grad; of a problem of
+    NumPy's arrays its blocks are such."""
     found = given_blocks(mpc, dtype)
     return found if mpc.disturbance is None else tightened(mpc, found, dtype)
 
@@ -164,13 +165,14 @@ def given_blocks(mpc: MPC, dtype: DTypeLike) -> list[Block]:
     """Return the blocks of a problem with their bounds as they are given."""
     system, N, n, m = mpc.system, mpc.horizon, mpc.system.n, mpc.system.m
     found: list[Block] = []
+    xp = namespace(mpc)
     state_names = system.state_names or tuple(f"x{i + 1}" for i in range(n))
     input_names = system.input_names or tuple(f"u{i + 1}" for i in range(m))
     of_states = state_names, system.state_units
     of_inputs = input_names, system.input_units
 
     def cast(v: Any) -> Array:
-        return jnp.asarray(v, dtype)
+        return xp.asarray(v, dtype)
 
     def add(
         kind: str,
@@ -207,7 +209,7 @@ def given_blocks(mpc: MPC, dtype: DTypeLike) -> list[Block]:
         limit: Any = mpc.input_rate_limit
         if not isinstance(limit, Box):
             limit = cast(limit)
-            limit = jnp.broadcast_to(limit, (m,)) if limit.ndim < 2 else limit
+            limit = xp.broadcast_to(limit, (m,)) if limit.ndim < 2 else limit
             limit = Box(-limit, limit)
         names = tuple(f"rate of {name}" for name in input_names)
         texts = names, tuple(f"{unit}/step" for unit in system.input_units)
@@ -217,7 +219,7 @@ def given_blocks(mpc: MPC, dtype: DTypeLike) -> list[Block]:
         stages, p = soft_stages(mpc, soft), cast(soft.C).shape[-2:-1]
         linear, quadratic = cast(soft.rho), 2 * cast(soft.quadratic)
         linear, quadratic = (
-            v if v.ndim == 2 else jnp.broadcast_to(v, p) for v in (linear, quadratic)
+            v if v.ndim == 2 else xp.broadcast_to(v, p) for v in (linear, quadratic)
         )
         texts = soft.names, soft.units
         more: dict[str, Any] = {"linear": linear, "quadratic": quadratic}
@@ -225,12 +227,22 @@ def given_blocks(mpc: MPC, dtype: DTypeLike) -> list[Block]:
     last = mpc.terminal_set
     if isinstance(last, Ellipsoid):  # x'Px = |L'x|²
         P = cast(last.P)
-        L, zero = cholesky((P + P.T) / 2), jnp.zeros(n, dtype)
+        L, zero = _root((P + P.T) / 2), np.zeros(n)
         texts = ("terminal ellipsoid",) * n, ()
-        add("terminal", L.T, None, (zero, zero), (N,), texts, radius=jnp.sqrt(cast(last.level)))
+        add("terminal", L.T, None, (zero, zero), (N,), texts, radius=xp.sqrt(cast(last.level)))
     elif last is not None:
         add_set("terminal", last, (N,), of_states)
     return found
+
+
+def _root(P: Any) -> Any:
+    """Return the lower triangular L with L L' = P, NaN where there is none."""
+    if namespace(P) is not np:
+        return cholesky(P)
+    try:
+        return np.linalg.cholesky(P)
+    except np.linalg.LinAlgError:
+        return np.full_like(P, np.nan)
 
 
 def bounds_of(found: list[Block], dtype: DTypeLike) -> Bounds:
@@ -240,10 +252,11 @@ def bounds_of(found: list[Block], dtype: DTypeLike) -> Bounds:
 
 def joined_bounds(each: list[Bounds], dtype: DTypeLike) -> Bounds:
     """Return the bounds of rows one after the other; those of balls are the last."""
-    joined = lambda parts: jnp.concatenate([jnp.zeros(0, dtype), *parts])
+    xp = namespace(each)
+    joined = lambda parts: xp.concatenate([xp.zeros(0, dtype), *parts])
     bounds = Bounds(joined(b.l for b in each), joined(b.u for b in each))
     if any(b.linear is not None for b in each):
-        hard = [(jnp.full_like(b.l, jnp.inf), jnp.zeros_like(b.l)) for b in each]
+        hard = [(xp.full_like(b.l, np.inf), xp.zeros_like(b.l)) for b in each]
         weights = [
             none if b.linear is None else (b.linear, b.quadratic)
             for b, none in zip(each, hard, strict=True)
@@ -252,7 +265,7 @@ def joined_bounds(each: list[Bounds], dtype: DTypeLike) -> Bounds:
         bounds = replace(bounds, linear=linear, quadratic=quadratic)
     balls = [b for b in each if b.balls]
     if balls:
-        radius = jnp.concatenate([b.radius for b in balls])
+        radius = xp.concatenate([b.radius for b in balls])
         bounds = replace(bounds, radius=radius, balls=tuple(b.balls[0] for b in balls))
     return bounds
 
@@ -279,6 +292,8 @@ def stacked(
     row that no input moves (with explicit Euler the position at k = 1) is one of zeros.
     """
     steps, r, m = np.array(block.steps, int), block.size, inputs[0].shape[1]
+    xp = namespace((states, inputs, block.H, block.D))
+    fixed = jax.lax.stop_gradient if xp is jnp else lambda tree: tree
 
     def added(x: Any, v: Any, H: Any, D: Any) -> Array:
         part: Any = 0.0
@@ -289,11 +304,11 @@ def stacked(
         return part.reshape((len(steps), r, *x.shape[2:]))
 
     parts = [added(x, v, block.H, block.D) for x, v in zip(states, inputs, strict=True)]
-    given = jax.lax.stop_gradient((states[0], inputs[0], block.H, block.D))
-    terms = added(*jax.tree.map(jnp.abs, given))
-    most = jnp.max(terms.reshape(len(steps), r, -1, m), axis=(0, 2), initial=0.0)
-    noise = 8 * jnp.finfo(terms.dtype).eps * jnp.tile(most, terms.shape[-1] // m)
-    none = jax.lax.stop_gradient(jnp.where(jnp.abs(parts[0]) <= noise, parts[0], 0.0))
+    given = fixed((states[0], inputs[0], block.H, block.D))
+    terms = added(*jax.tree.map(xp.abs, given))
+    most = xp.max(terms.reshape(len(steps), r, -1, m), axis=(0, 2), initial=0.0)
+    noise = 8 * xp.finfo(terms.dtype).eps * xp.tile(most, terms.shape[-1] // m)
+    none = fixed(xp.where(xp.abs(parts[0]) <= noise, parts[0], 0.0))
     C, D, d = (v.reshape(-1, *v.shape[2:]) for v in (parts[0] - none, *parts[1:]))
     return C, D, d
 

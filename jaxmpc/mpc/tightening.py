@@ -26,7 +26,7 @@ from jaxmpc.arrays import host_array
 from jaxmpc.checks import concrete, fail
 from jaxmpc.mpc.problem import MPC, dynamics_of
 from jaxmpc.qp.jax_transformations import varying
-from jaxmpc.qp.linalg import matmul
+from jaxmpc.qp.linalg import matmul, namespace
 from jaxmpc.sets.disturbances import (
     disturbance_columns,
     largest_entries,
@@ -77,28 +77,37 @@ def require_tightened(mpc: MPC, what: str) -> None:
 
 def margins(mpc: MPC, found: Sequence[Any], dtype: DTypeLike) -> list[tuple[Array, Array]]:
     """Return for each block of rows (steps, r) what σ takes from its lower and from its upper
-    bounds. Works inside jit, vmap and grad."""
+    bounds. Works inside jit, vmap and grad; of NumPy's arrays in NumPy."""
+    K = feedback_gain(mpc)
+    xp = namespace((mpc, K, [(b.H, b.D) for b in found]))
     A, B, _ = dynamics_of(mpc.system, dtype)
-    K = jnp.asarray(feedback_gain(mpc), dtype)
+    K = xp.asarray(K, dtype)
     n, N = mpc.system.n, mpc.horizon
-    E = jnp.eye(n, dtype=dtype)
+    E = xp.eye(n, dtype=dtype)
     if mpc.disturbance_matrix is not None:
-        E = jnp.asarray(mpc.disturbance_matrix, dtype)
+        E = xp.asarray(mpc.disturbance_matrix, dtype)
     closed, W = A + matmul(B, K), with_vertices(mpc.disturbance)
-    parts = [jnp.zeros((0, n), dtype)]
+    parts = [xp.zeros((0, n), dtype)]
     for b in found:
-        states = jnp.zeros((b.size, n), dtype) if b.H is None else b.H
+        states = xp.zeros((b.size, n), dtype) if b.H is None else b.H
         parts.append(states if b.D is None else states + matmul(b.D, K))
     rate = np.concatenate([np.zeros(0, bool), *(np.full(b.size, b.rate) for b in found)])
 
-    def step(G: Array, j: Array) -> tuple[Array, tuple[Array, Array]]:
+    def step(G: Array, j: Any) -> tuple[Array, tuple[Array, Array]]:
         along = matmul(G, E)
-        later = matmul(G, closed) - jnp.where(((j == 0) & rate)[:, None], G, 0.0)
+        later = matmul(G, closed) - xp.where(((j == 0) & rate)[:, None], G, xp.zeros_like(G))
         return later, (worst(W, -along), worst(W, along))
 
-    first = varying(jnp.concatenate(parts), (closed, E, W))
-    _, each = jax.lax.scan(step, first, jnp.arange(N))
-    sums = [jnp.cumsum(jnp.pad(v, ((1, 0), (0, 0))), axis=0) for v in each]
+    G = xp.concatenate(parts)
+    if xp is np:
+        taken = []
+        for j in range(N):
+            G, pair = step(G, j)
+            taken.append(pair)
+        each: Any = [np.array(v) for v in zip(*taken, strict=True)]
+    else:
+        _, each = jax.lax.scan(step, varying(G, (closed, E, W)), jnp.arange(N))
+    sums = [xp.cumsum(xp.pad(v, ((1, 0), (0, 0))), axis=0) for v in each]
     ends = itertools.pairwise(np.cumsum([0, *(b.size for b in found)]))
     places = [(np.array(b.steps, int), slice(*ij)) for b, ij in zip(found, ends, strict=True)]
     return [(sums[0][steps, part], sums[1][steps, part]) for steps, part in places]

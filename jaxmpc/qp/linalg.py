@@ -46,12 +46,24 @@ LANES = 64
 TOGETHER = 100_000
 
 
+def namespace(tree: Any) -> Any:
+    """Return NumPy where all leaves of the tree are its arrays or numbers, else `jax.numpy`.
+
+    What is computed once a problem is written for both: JAX compiles a program where something is
+    traced, and from plain Python NumPy is done before a compiler had begun.
+    """
+    own = np.ndarray | np.generic | float | int
+    return np if all(isinstance(leaf, own) for leaf in jax.tree.leaves(tree)) else jnp
+
+
 def matmul(a: Array, b: Array) -> Array:
-    """Matrix product at full precision of the data's type.
+    """Matrix product at full precision of the data's type; of NumPy's arrays one of these.
 
     Vectors stand on the left, x'M: under `vmap` with M unbatched that is one product of the
     batch (B, n)·(n, m) without a transposition.
     """
+    if namespace((a, b)) is np:
+        return np.matmul(a, b)
     return jnp.matmul(a, b, precision=PRECISION)
 
 

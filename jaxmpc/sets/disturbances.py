@@ -8,14 +8,13 @@ h_W(g) = max {g'w : w ∈ W}.
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from jaxmpc.arrays import Reals, as_array, as_column, host_array, store_floats
 from jaxmpc.checks import concrete, fail, require_finite, require_shape
 from jaxmpc.pytrees import pytree
-from jaxmpc.qp.linalg import matmul
+from jaxmpc.qp.linalg import matmul, namespace
 from jaxmpc.sets.convex_sets import (
     AnyNumber,
     Box,
@@ -177,11 +176,16 @@ def with_vertices(W: Any) -> Any:
 
 
 def worst(W: Any, rows: Array) -> Array:
-    """Return h_W(g) of each row g of `rows` (r, n). Works inside jit, vmap and grad."""
+    """Return h_W(g) of each row g of `rows` (r, n). Works inside jit, vmap and grad; of NumPy's
+    arrays in NumPy."""
     W = with_vertices(W)
+    xp = namespace((W, rows))
+    W = jax.tree.map(lambda v: xp.asarray(v, rows.dtype), W)
     if isinstance(W, Vertices):
-        return jnp.max(matmul(rows, jnp.asarray(W.points, rows.dtype).T), axis=1)
-    W = jax.tree.map(lambda v: jnp.asarray(v, rows.dtype), W)
+        points: Any = W.points
+        return xp.max(matmul(rows, points.T), axis=1)
+    if xp is np:
+        return xp.array([W.support(row) for row in rows], rows.dtype)
     return jax.vmap(W.support)(rows)
 
 

@@ -77,8 +77,8 @@ def test_interrupted_resumed_and_judged(tmp_path, monkeypatch, capsys, mpc):
     """Ctrl-C in the second chunk loses that chunk only; the table is that of the states."""
     real, asked = stored_runs.simulate_many, []
 
-    def default(robot, Q, R, horizon, *, target, margin):
-        assert (Q, R, horizon, target, margin) == (None, None, mpc.horizon, None, 0.02)
+    def default(robot, *, horizon, target, margin):  # no weights, which no option gives
+        assert (horizon, target, margin) == (mpc.horizon, None, 0.02)
         return mpc
 
     def interrupted(*args, **kwargs):

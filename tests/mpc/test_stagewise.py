@@ -142,6 +142,7 @@ def test_iterates_are_those_of_the_dense_solver(kind):
     np.testing.assert_allclose(y_stages, np.where(moved, E_dense * y, 0), atol=1e-8)
 
 
+@pytest.mark.slow
 def test_plan_is_that_of_solve():
     """All fields, with references."""
     mpc = problem()

@@ -237,9 +237,8 @@ def test_steps_of_admm_that_move_nothing_are_inaccurate():
     advises, would be in vain."""
     one = np.ones(1, np.float32)
     qp = jm.QP(one[None], -1e5 * one / 3, one[None], -one, one / 3)
-    for steps, status in ((0, "ITERATION_LIMIT"), (200, "INACCURATE")):
-        solver = jm.ADMM(iterations=steps, newton_steps=0, eps=0.0)
-        assert jm.Status(int(jm.solve_qp(qp, solver).status)).name == status
+    solver = jm.ADMM(iterations=200, newton_steps=0, eps=0.0)
+    assert jm.Status(int(jm.solve_qp(qp, solver).status)).name == "INACCURATE"
 
 
 def test_solutions_say_what_their_status_means():

@@ -304,8 +304,8 @@ def gap(model, robot):
     return worst
 
 
-QUICK = ("flag spring", "actuatorgroupdisable", "actuatorgravcomp with actuatorfrcrange")
-QUICK_NAMED = ("damping=.1 .5 .2", "delay", "armature")
+QUICK = ("actuatorgravcomp with actuatorfrcrange",)
+QUICK_NAMED = ("damping=.1 .5 .2", "armature")
 
 
 def quick_first(names, quick):

@@ -9,6 +9,8 @@ import pytest
 import jaxmpc as jm
 from jaxmpc.robots.force_limits import ForceLimits, force_limits, stopping_limits
 
+pytestmark = pytest.mark.usefixtures("uncompared")
+
 SERVO = """<mujoco><option gravity="0 0 0" integrator="implicitfast"/><worldbody><body>
 <joint name="j" axis="0 0 1"/><geom type="capsule" fromto="0 0 0 1 0 0" size=".02" mass="3"/></body>
 </worldbody><actuator><position joint="j" kp="200" kv="20" ctrlrange="-1.2 1.2" forcerange="-3 3"/>

@@ -13,6 +13,8 @@ import jaxmpc as jm
 from jaxmpc.robots import jaxpr_rewriting
 from jaxmpc.robots.configurations import difference, retract
 
+pytestmark = pytest.mark.usefixtures("uncompared")
+
 SLOW = ["quadrotor"] + [
     pytest.param(name, marks=pytest.mark.slow)
     for name in ("joint", "pendulum", "cartpole", "arm6", "arm7", "mixed")

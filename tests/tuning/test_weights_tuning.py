@@ -29,6 +29,7 @@ MPC = jm.MPC(
     terminal_cost=np.diag([4.0, 0.5]),
     constrain_initial=False,
 )
+NOISE = jm.closed_loop.Noise(process=0.01, seed=3)
 SOLVER = jm.ADMM(iterations=80, newton_steps=0, eps=1e-3)  # compiles fastest
 LOSS = ClosedLoopLoss(np.diag([4.0, 0.5]), [0.02], limits=LIMITS, violation=5.0)
 PARAMETERS = {"Q": Parameter(MPC.Q / 4, "definite"), "R": Parameter(10 * MPC.R, "diagonal")}
@@ -363,10 +364,10 @@ def test_bad_losses(more, message):
         ClosedLoopLoss(**{"Q": [1.0, 1.0], "R": [1.0], **more})
 
 
-def test_loops_have_the_conditions_of_simulate(x64):
-    """A delay, a disturbance and noise: the loss is that of `simulate_many` under the same."""
-    x0s, noise = starts(6), jm.closed_loop.Noise(process=0.01, seed=3)
-    conditions = {"delay": 1, "noise": noise, "disturbance": np.tile([0.0, 0.01], (8, 1))}
+@pytest.mark.slow
+def test_training_and_validation_have_the_conditions_of_simulate(x64):
+    x0s = starts(6)
+    conditions = {"delay": 1, "noise": NOISE, "disturbance": np.tile([0.0, 0.01], (8, 1))}
     tuned = tune(x0s, loss=LOSS, conditions=conditions, updates=1, validation=0.5, batch=3)
     at_start = jm.Controller(weighed({k: v.value for k, v in PARAMETERS.items()}), SOLVER)
     run = jm.closed_loop.simulate_many(at_start, SYSTEM, x0s, 8, **conditions)
@@ -375,6 +376,22 @@ def test_loops_have_the_conditions_of_simulate(x64):
     train, test = Settings(validation=0.5, batch=3).split((np.arange(6), {}))
     wanted = losses[train[0]].mean(), losses[test[0]].mean()
     np.testing.assert_allclose(sorted(found), sorted(wanted), rtol=1e-9)
+
+
+def test_loops_have_the_conditions_of_simulate(x64):
+    """A delay, a disturbance and noise: the losses are those of `simulate_many` under the same."""
+    x0s, start = starts(6), {k: v.value for k, v in PARAMETERS.items()}
+    conditions = {"delay": 1, "noise": NOISE, "disturbance": np.tile([0.0, 0.01], (8, 1))}
+    objective = weights.ClosedLoopObjective(
+        lambda v: jm.Controller(weighed(v), SOLVER), PARAMETERS, SYSTEM, 8, LOSS, None, None, None,
+        conditions,
+    )  # fmt: skip
+    theta = {k: v.raw() for k, v in PARAMETERS.items()}
+    found = jax.jit(lambda theta: objective.total(theta, SYSTEM, x0s, {}, np.ones(6))[1])(theta)
+    at_start = jm.Controller(weighed(start), SOLVER)
+    run = jm.closed_loop.simulate_many(at_start, SYSTEM, x0s, 8, **conditions)
+    losses = jax.vmap(LOSS)(jax.tree.map(jnp.asarray, run))
+    np.testing.assert_allclose(found["losses"], losses, rtol=1e-9)
 
 
 @pytest.mark.slow
