@@ -40,8 +40,10 @@ from jaxmpc.qp.linalg import (
     arrays,
     by_step,
     floating_dtype,
+    host_arrays,
     matmul,
     namespace,
+    on_device,
     solve,
 )
 from jaxmpc.qp.problem import QP, Bounds
@@ -234,8 +236,7 @@ def condense(mpc: MPC) -> Condensed:
     if mpc.disturbance is not None and concrete(mpc):
         require_room(mpc, blocks(mpc, float))
     if concrete(mpc):
-        made = _condense(jax.tree.map(np.asarray, arrays(mpc)))
-        return jax.tree.map(jnp.array, made)
+        return on_device(_condense(host_arrays(mpc)))
     return _condense_in_jax(arrays(mpc))
 
 

@@ -99,7 +99,8 @@ class Controller:
         mpc, finite = harmless(with_gain(self.mpc))
         condensed = condensed_plan(mpc)
         # The factorization reads from P what is wrong with the data.
-        condensed = replace(condensed, P=jnp.where(finite, condensed.P, jnp.nan))
+        if finite is not True:
+            condensed = replace(condensed, P=jnp.where(finite, condensed.P, jnp.nan))
         self.solver.validate(condensed.C.shape[0])
         # Arrays from here on, so that a time step need not convert the whole object again.
         given = arrays((replace(mpc, prestabilise=condensed.K), self.solver))

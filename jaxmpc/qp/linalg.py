@@ -100,10 +100,23 @@ def arrays(tree: T) -> T:
     return jax.tree.map(cast, tree)
 
 
+def host_arrays(tree: T) -> T:
+    """`arrays`, of NumPy: in the types that JAX gives them in the present precision."""
+    cast = lambda v: np.asarray(v, jax.dtypes.canonicalize_dtype(jnp.result_type(v)))
+    return jax.tree.map(cast, tree)
+
+
+def on_device(tree: T) -> T:
+    """Return arrays of NumPy as arrays of JAX whose memory is their own. (`jnp.array` compiles a
+    program for each shape, in JAX 0.12.)"""
+    return jax.tree.map(lambda v: jax.device_put(np.array(v)), tree)
+
+
 def floating_dtype(tree: Any) -> jnp.dtype:
     """The widest floating type among the leaves, at least float32: no factorization exists in half
     precision. JAX's default float where there is none."""
-    types = [leaf.dtype for leaf in jax.tree.leaves(arrays(tree))]
+    of = lambda leaf: jax.dtypes.canonicalize_dtype(jnp.result_type(leaf))
+    types = [of(leaf) for leaf in jax.tree.leaves(tree)]
     floats = [dtype for dtype in types if jnp.issubdtype(dtype, jnp.floating)]
     if not floats:
         return jnp.result_type(float)
