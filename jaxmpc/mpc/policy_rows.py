@@ -42,7 +42,7 @@ from jaxmpc.mpc.rows import Block, given_blocks, row_count
 from jaxmpc.mpc.tightening import feedback_gain, require_room, without_disturbance
 from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.jax_transformations import compiled_lightly, own_modes
-from jaxmpc.qp.linalg import arrays, matmul
+from jaxmpc.qp.linalg import arrays, matmul, namespace
 from jaxmpc.qp.problem import QP
 from jaxmpc.sets.convex_sets import Box, Zonotope
 from jaxmpc.sets.disturbances import with_vertices, worst
@@ -327,6 +327,7 @@ def tightened_by(
     """Return the bounds (steps, r) of each block that are left to the nominal trajectory of a
     tube."""
     sides = []
+    xp = namespace((mpc, section, gain, [(b.H, b.D) for b in found]))
     for b in found:
         along: Any = 0.0 if b.H is None else b.H
         along = along if b.D is None else along + matmul(b.D, gain)
@@ -336,11 +337,11 @@ def tightened_by(
             A, B, _ = dynamics_of(mpc.system, along.dtype)
             push: Any = along
             if mpc.disturbance_matrix is not None:
-                push = matmul(along, jnp.asarray(mpc.disturbance_matrix, along.dtype))
+                push = matmul(along, xp.asarray(mpc.disturbance_matrix, along.dtype))
             low, high = worst(mpc.disturbance, -push), worst(mpc.disturbance, push)
             along = matmul(along, A + matmul(B, gain)) - along
-        middle = matmul(along, jnp.asarray(section.center, along.dtype))
-        half = jnp.sum(jnp.abs(matmul(along, jnp.asarray(section.generators, along.dtype))), axis=1)
+        middle = matmul(along, xp.asarray(section.center, along.dtype))
+        half = xp.sum(xp.abs(matmul(along, xp.asarray(section.generators, along.dtype))), axis=1)
         # The first rate is that of the input that is applied.
         later = np.array([not (b.rate and k == 0) for k in b.steps], float)[:, None]
         low, high = later * (low + half - middle), later * (high + half + middle)

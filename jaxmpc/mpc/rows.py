@@ -165,7 +165,7 @@ def given_blocks(mpc: MPC, dtype: DTypeLike) -> list[Block]:
     """Return the blocks of a problem with their bounds as they are given."""
     system, N, n, m = mpc.system, mpc.horizon, mpc.system.n, mpc.system.m
     found: list[Block] = []
-    xp = namespace(mpc)
+    xp, dtype = namespace(mpc), jax.dtypes.canonicalize_dtype(dtype)
     state_names = system.state_names or tuple(f"x{i + 1}" for i in range(n))
     input_names = system.input_names or tuple(f"u{i + 1}" for i in range(m))
     of_states = state_names, system.state_units
