@@ -53,7 +53,7 @@ from jaxmpc.pytrees import prepared_pytree
 from jaxmpc.qp.admm import ADMM, DEFAULT, Factor, factorise
 from jaxmpc.qp.dual import has_dual_steps
 from jaxmpc.qp.jax_transformations import compiled_lightly, own_modes, varying
-from jaxmpc.qp.linalg import apply, arrays, matmul, rounding
+from jaxmpc.qp.linalg import apply, arrays, host_arrays, matmul, on_device, rounding
 from jaxmpc.qp.problem import QP, QPSolution
 from jaxmpc.qp.residuals import SHARE, Measured, Terms, worst
 from jaxmpc.qp.solve import in_two_parts, solve_factored
@@ -103,9 +103,8 @@ class Controller:
             condensed = replace(condensed, P=jnp.where(finite, condensed.P, jnp.nan))
         self.solver.validate(condensed.C.shape[0])
         # Arrays from here on, so that a time step need not convert the whole object again.
-        given = arrays((replace(mpc, prestabilise=condensed.K), self.solver))
-        made = condensed, _factor(condensed, self.solver)
-        parts = unshared((*given, *made))
+        given = replace(mpc, prestabilise=condensed.K), self.solver
+        parts = unshared((*given, condensed, _factor(condensed, self.solver)))
         vars(self).update(zip(("mpc", "solver", "condensed", "factor"), parts, strict=True))
 
     def __repr__(self) -> str:
@@ -229,8 +228,12 @@ def unshared(parts: tuple) -> tuple:
         seen.add(id(v))
         return jnp.array(v) if again and concrete(v) else v
 
-    given = jax.tree.map(lambda v: jnp.array(v) if concrete(v) else v, parts[:2])
-    return jax.tree.map(own, (*given, *parts[2:]))
+    def copied(v: Any) -> Any:
+        if not concrete(v):
+            return arrays(v)
+        return jnp.array(arrays(v)) if isinstance(v, Array) else on_device(host_arrays(v))
+
+    return jax.tree.map(own, (*jax.tree.map(copied, parts[:2]), *parts[2:]))
 
 
 def harmless(mpc: MPC) -> tuple[MPC, Any]:

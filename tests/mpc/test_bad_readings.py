@@ -39,19 +39,22 @@ def loop(controller, x):
 
     def sample(memory, x):
         before, last = memory
-        control = controller(x, before)
-        (u, plan, _), cold = control, after_input(controller, x, last).plan
+        # Side by side, so that one solve is compiled.
+        pair = jax.tree.map(lambda *v: jnp.stack(v), before, the_input_alone(controller, x, last))
+        both = jax.vmap(controller, (None, 0))(x, pair)
+        control, cold = (jax.tree.map(lambda v, i=i: v[i], both) for i in (0, 1))
+        (u, plan, _), cold = control, cold.plan
         return (control, u), (u, plan.status, plan.inputs[0], cold.status, cold.inputs[0])
 
     memory = controller.start(x[0]), jnp.zeros(controller.mpc.system.m)
     return jax.lax.scan(sample, memory, x)[1]
 
 
-def after_input(controller, x, last):
-    """What the controller gives at x when all it remembers is the input `last`."""
+def the_input_alone(controller, x, last):
+    """What a controller has to remember that remembers nothing but the input `last`."""
     start = controller.start(x)
     inputs = jnp.broadcast_to(last, start.memory.inputs.shape)
-    return controller(x, start._replace(u=last, memory=start.memory._replace(inputs=inputs)))
+    return start._replace(u=last, memory=start.memory._replace(inputs=inputs))
 
 
 def readings(good):
@@ -157,7 +160,7 @@ def fuzzed(controller, key):
         )
         last = jnp.where(jnp.isfinite(before.u), before.u, 0.0)
         control = controller(x, before)
-        (u, plan, _), cold = control, after_input(controller, x, last).plan
+        (u, plan, _), cold = control, controller(x, the_input_alone(controller, x, last)).plan
         claimed = (plan.status == jm.Status.SOLVED) & ~broken
         step = lambda x, u: (A @ x + B @ u,) * 2
         led = jax.lax.scan(step, x, plan.inputs)[1]
