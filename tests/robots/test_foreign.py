@@ -42,7 +42,7 @@ def loaded(name):
 
 
 @pytest.mark.parametrize("name", SHORT)
-@pytest.mark.first(2)
+@pytest.mark.first(1)
 def test_set_points_balance_or_say_so(name):
     robot, x, u, said = loaded(name)
     data = data_at(robot.predictor.model, x, u)
