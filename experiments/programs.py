@@ -1,4 +1,5 @@
-"""How often programs are traced and compiled, by first calls and by later ones.
+"""How often programs are traced and compiled, by first calls and by later ones, and the processor
+time of each.
 
     python experiments/programs.py
 
@@ -7,6 +8,7 @@ executable of it. Times, memory and growth: `python experiments/bench`.
 """
 
 import functools
+import time
 from collections import Counter
 from collections.abc import Callable
 from typing import Any
@@ -33,6 +35,7 @@ def print_programs() -> None:
         "first solve": lambda: jm.solve(mpc, x[0]),
         "second solve, other state": lambda: jm.solve(mpc, x[1]),
         "solve, other weights": lambda: jm.solve(joint_with(2.0), x[0]),
+        "Controller": lambda: controller().factor,
         "Controller, first call": lambda: controller()(x[0]),
         "its first call after another": lambda: controller()(x[0], controller()(x[1])),
         "ten more": lambda: [controller()(x[0], controller()(x[1])) for _ in range(10)],
@@ -41,8 +44,11 @@ def print_programs() -> None:
     }
     for name, call in calls.items():
         counts.clear()
+        begun = time.process_time()
         jax.block_until_ready(jax.tree.leaves(call()))
-        print(f"traced {counts[TRACED]:4}, compiled {counts[COMPILED]:3}: {name}", flush=True)
+        seconds = time.process_time() - begun
+        what = f"traced {counts[TRACED]:4}, compiled {counts[COMPILED]:3}, {seconds:5.2f} s"
+        print(f"{what}: {name}", flush=True)
 
 
 def joint_with(weight: float) -> jm.MPC:

@@ -267,7 +267,6 @@ def _condense(mpc: MPC) -> Condensed:
     dtype = floating_dtype(replace(mpc, prestabilise=None))
     xp = namespace(mpc)
     inverse_times: Any = solve if xp is jnp else np.linalg.solve
-    options: Any = {"precision": "highest"} if xp is jnp else {"optimize": True}
     cast = lambda v: xp.asarray(v, dtype)
     weights = Q, R, P_N, W = weights_of(mpc, dtype)
     A, B, c = dynamics_of(system, dtype)
@@ -295,16 +294,15 @@ def _condense(mpc: MPC) -> Condensed:
     )
 
     of_states = xp.concatenate([xp.broadcast_to(Q, (N, n, n)), P_N[None]])
-    product = lambda M, weight, X: xp.einsum(
-        f"kai,{'kab' if weight.ndim == 3 else 'ab'},kb...->i...", M, weight, X, **options
-    )
-    # 2 Σ_k M_k' W_k X_k with the weights of states, inputs and rates: the Hessian for X = Γ, the
-    # part of the linear term in θ for X = Φ, its constant part for X = φ.
-    form = lambda X, U, V: (
-        2 * (product(Gamma, of_states, X) + product(Omega, R, U) + product(rates[0], W, V))
-    )
-    if mpc.input_rate_weight is None:
-        form = lambda X, U, V: 2 * (product(Gamma, of_states, X) + product(Omega, R, U))
+
+    def form(X: Array, U: Array, V: Array) -> Array:
+        """Return 2 Σ_k M_k' W_k X_k with the weights of states, inputs and rates: the Hessian for
+        X = Γ, the part of the linear term in θ for X = Φ, its constant part for X = φ."""
+        total = _weighted_sum(Gamma, of_states, X) + _weighted_sum(Omega, R, U)
+        if mpc.input_rate_weight is not None:
+            total = total + _weighted_sum(rates[0], W, V)
+        return 2 * total
+
     P = form(Gamma, Omega, rates[0])
 
     # argmin over u of u'Ru + (Ax + Bu)'P(Ax + Bu) with the data of the last step, the least of
@@ -347,6 +345,16 @@ def _condense(mpc: MPC) -> Condensed:
         balls=bounds.balls,
         begins=tuple(int(k) for k in np.unique(mpc.moves, return_index=True)[1]),
     )
+
+
+def _weighted_sum(M: Array, weight: Array, X: Array) -> Array:
+    """Return Σ_k M_k' W_k X_k: M (N, a, i), W (a, a), or one a step, X (N, a, …)."""
+    xp = namespace((M, weight, X))
+    if xp is np:
+        weighted = matmul(weight, X) if X.ndim == 3 else apply(weight, X)
+        return xp.tensordot(M, weighted, ((0, 1), (0, 1)))
+    of_steps = "kab" if weight.ndim == 3 else "ab"
+    return jnp.einsum(f"kai,{of_steps},kb...->i...", M, weight, X, precision="highest")
 
 
 _condense_in_jax = compiled_lightly(0)(own_modes(_condense))
