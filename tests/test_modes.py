@@ -116,7 +116,13 @@ def near(one, other):
     jax.tree.map(lambda v, w: np.testing.assert_allclose(v, w, rtol=2e-3, atol=2e-3), one, other)
 
 
-@pytest.mark.first(1)
+def test_a_plan_is_traced_without_implicit_promotion():
+    """The modes act on what is traced, so that nothing need be compiled here."""
+    with jax.numpy_rank_promotion("raise"), jax.numpy_dtype_promotion("strict"):
+        jax.jit(many("plan")).trace(XS)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_no_implicit_promotion(name):
     """Neither of ranks nor of types, by a user who has forbidden both."""

@@ -67,8 +67,9 @@ def test_runs_are_stored_resumed_and_those_of_simulate_many(tmp_path, monkeypatc
     np.testing.assert_array_equal(data["states"], run.states)
     np.testing.assert_array_equal(data["points"], x0s)
     np.testing.assert_array_equal(data["mass"], factors["mass"])
-    again = simulate_into(path, feedback, joint, x0s[:4], STEPS, overwrite=True)
-    assert again.run.states.shape == (4, STEPS + 1, 2) and again.timing.count == 4
+    options["factors"] = {name: v[:3] for name, v in factors.items()}
+    again = simulate_into(path, feedback, joint, x0s[:3], STEPS, overwrite=True, **options)
+    assert again.run.states.shape == (3, STEPS + 1, 2) and again.timing.count == 3
 
 
 def test_summary_says_what_the_states_say(joint, feedback):
