@@ -29,6 +29,7 @@ from jaxmpc.mpc.rows import Layout, blocks, bounds_of, layout_of, split, stacked
 from jaxmpc.mpc.stagewise.recursion_kernels import riccati_recursion
 from jaxmpc.mpc.tightening import require_room, require_tightened, with_gain
 from jaxmpc.pytrees import pytree, static
+from jaxmpc.qp.admm import ADMM, Factor, factorise
 from jaxmpc.qp.jax_transformations import (
     compiled_lightly,
     differentiated_apart,
@@ -110,6 +111,10 @@ class Condensed:
         l, u = self.lower - constant, self.upper - constant
         soft = self.soft_linear, self.soft_quadratic
         return QP(self.P, q, self.C, l, u, *soft, self.radius, self.limits.sizes(), self.balls)
+
+    def factor(self, solver: ADMM) -> Factor:
+        """Return what the matrices of the QP decide about its solution by `solver`."""
+        return factorise(self.P, self.C, solver, self.balls)
 
     @property
     def limits(self) -> Bounds:

@@ -50,7 +50,7 @@ from jaxmpc.mpc.problem import MPC, at_stage, dynamics_of
 from jaxmpc.mpc.rows import blocks, dynamics_terms, given_blocks, split
 from jaxmpc.mpc.tightening import with_gain
 from jaxmpc.pytrees import prepared_pytree
-from jaxmpc.qp.admm import ADMM, DEFAULT, Factor, factorise
+from jaxmpc.qp.admm import ADMM, DEFAULT, Factor
 from jaxmpc.qp.dual import has_dual_steps
 from jaxmpc.qp.jax_transformations import compiled_lightly, own_modes, varying
 from jaxmpc.qp.linalg import apply, arrays, host_arrays, matmul, on_device, rounding
@@ -264,7 +264,7 @@ def zeros_of(controller: Callable[[Array], Control[Planned]], x: Array) -> Contr
 @compiled_lightly(0)
 @own_modes
 def _factor(condensed: Condensed, solver: ADMM) -> Factor:
-    made = factorise(condensed.P, condensed.C, solver, condensed.balls)
+    made = condensed.factor(solver)
     return replace(made, row_norms=condensed.reach(made.row_norms))
 
 

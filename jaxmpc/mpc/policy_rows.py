@@ -41,8 +41,9 @@ from jaxmpc.mpc.problem import MPC, dynamics_of
 from jaxmpc.mpc.rows import Block, given_blocks, row_count
 from jaxmpc.mpc.tightening import feedback_gain, require_room, without_disturbance
 from jaxmpc.pytrees import pytree, static
+from jaxmpc.qp.admm import ADMM, SPLIT, Factor, factorise
 from jaxmpc.qp.jax_transformations import compiled_lightly, own_modes
-from jaxmpc.qp.linalg import arrays, matmul, namespace
+from jaxmpc.qp.linalg import arrays, inverse_root, matmul, namespace
 from jaxmpc.qp.problem import QP
 from jaxmpc.sets.convex_sets import Box, Zonotope
 from jaxmpc.sets.disturbances import with_vertices, worst
@@ -62,13 +63,19 @@ class PolicyCondensed(Condensed):
     response_to_disturbances: (N, m, N p), what inputs do about disturbances before any M, and
     of_answers: (N, m, N m), what they do about M; None for tubes. extent: (nz,) and (nz, p), by
     which and by how much for each |θ_i| the entries of a feasible z are bounded; None where inputs
-    have no Box.
+    have no Box. curvature (nz,): what stands for P's diagonal in the solver's metric where
+    variables cost nothing, from how far the limits are (`scales_of_rows`); 0 of the others.
     """
 
     response_to_disturbances: Any
     of_answers: Any
     extent: Any
+    curvature: Array
     copies: int = static()
+
+    def factor(self, solver: ADMM) -> Factor:
+        """Return what the matrices of the QP decide, in a metric that knows its limits too."""
+        return factorise(self.P, self.C, solver, self.balls, self.curvature)
 
     def qp(
         self,
@@ -224,6 +231,30 @@ def _plan_extent(nominal: Condensed, reach: Array) -> tuple[Array, tuple[Array, 
     return back, (constant, matmul(back, jnp.abs(nominal.Psi).reshape(size, -1)))
 
 
+def scales_of_rows(P: Array, C: Array, below: Array, above: Array) -> tuple[Array, Array]:
+    """Return the width of each row (rows,) and its typical multiplier (rows,), where it has limits
+    at these distances below and above the value at z = 0; ∞ and 0 of rows without.
+
+    P and A alone say nothing of how large variables without a cost are, nor of the force on them,
+    and a metric for them takes a force over a size. The size is known here. The force follows from
+    the multipliers: with W the distance between the limits, or twice that of the only one, a plan
+    that moves row c by W costs W² / c'P⁻¹c, and J, the least of these, is what a plan costs that
+    limits bend. The multiplier of a row is then J/W. Units of variables, rows and cost play no
+    part.
+    """
+    size = jnp.diag(P)
+    unit = 1 / jnp.sqrt(jnp.where(size > 0, size, 1.0))
+    scaled = unit[:, None] * P * unit + SPLIT * jnp.eye(len(P), dtype=P.dtype)
+    moved = jnp.sum(matmul(C * unit, inverse_root(scaled).T) ** 2, axis=1)
+    width = jnp.where(
+        jnp.isfinite(below + above), below + above, 2 * jnp.minimum(jnp.abs(below), jnp.abs(above))
+    )
+    width = jnp.where(width > 0, width, jnp.inf)
+    cost = jnp.where(moved > 0, width**2 / jnp.where(moved > 0, moved, 1.0), jnp.inf)
+    least = jnp.min(cost, initial=jnp.inf)
+    return width, jnp.where(jnp.isfinite(least), least, 0.0) / width
+
+
 def _input_sizes(mpc: MPC, dtype: DTypeLike) -> tuple[Array, Array] | None:
     """Return the largest |u_i| (m,) and half the width of the limits of inputs; None without a
     Box."""
@@ -298,6 +329,16 @@ def _affine(nominal: Condensed, each: Condensed, mpc: MPC) -> PolicyCondensed:
             T, T_of_theta = jnp.where(soft, least, T), jnp.where(soft[:, None], 0.0, T_of_theta)
         extent = jnp.append(plan, T), jnp.concatenate([of_theta, T_of_theta])
         extent = jax.lax.stop_gradient(jax.tree.map(lambda v: jnp.minimum(v, LARGE), extent))
+    # T and M are as large as what moves a row by its width. The two rows of an entry of T share the
+    # multiplier of that for whose sum it is.
+    width, multiplier = scales_of_rows(nominal.P, G, d - nominal.lower, nominal.upper - d)
+    of_M_alone = jnp.abs(answers[:, G.shape[1] :])
+    curvature = jnp.concatenate([
+        jnp.zeros(G.shape[1], dtype),
+        jnp.sqrt(2 * jnp.sum((of_M_alone * multiplier[row][:, None]) ** 2, axis=0))
+        * jnp.max(of_M_alone / width[row][:, None], axis=0, initial=0.0),
+        jnp.sqrt(2.0) * multiplier[row] / width[row],
+    ])  # fmt: skip
     return _widened(
         nominal,
         C=jnp.block([[value, sums], [value, -sums], [answers, -one], [answers, one]]),
@@ -307,6 +348,7 @@ def _affine(nominal: Condensed, each: Condensed, mpc: MPC) -> PolicyCondensed:
         response=response,
         of_answers=each.Omega,
         extent=extent,
+        curvature=curvature,
         copies=2,
     )
 
@@ -377,15 +419,19 @@ def _tube(nominal: Condensed, mpc: MPC, gain: Array, section: Zonotope) -> Polic
         _, (plan, of_theta) = _plan_extent(nominal, sizes[0] + jnp.sum(jnp.abs(inputs), axis=0))
         extent = jnp.append(plan, jnp.ones(count, dtype)), jnp.pad(of_theta, ((0, count), (0, 0)))
         extent = jax.lax.stop_gradient(extent)
+    d = nominal.d - along(center)
+    _, multiplier = scales_of_rows(nominal.P, nominal.C, d - lower, upper - d)
+    force = jnp.sqrt(jnp.sum((moves * multiplier[:, None]) ** 2, axis=0))  # ζ is of size 1
     return _widened(
         nominal,
         C=jnp.block([[nominal.C, -moves], [zero, one]]),
-        d=jnp.concatenate([nominal.d - along(center), jnp.zeros(count, dtype)]),
+        d=jnp.concatenate([d, jnp.zeros(count, dtype)]),
         lower=jnp.concatenate([lower, -jnp.ones(count, dtype)]),
         upper=jnp.concatenate([upper, jnp.ones(count, dtype)]),
         response=None,
         of_answers=None,
         extent=extent,
+        curvature=jnp.pad(force, (nominal.C.shape[1], 0)),
         copies=1,
     )
 
@@ -399,6 +445,7 @@ def _widened(
     response: Any,
     of_answers: Any,
     extent: Any,
+    curvature: Array,
     copies: int,
 ) -> PolicyCondensed:
     """Return the QP with these rows and as many variables, of which the first are the plan's."""
@@ -432,5 +479,6 @@ def _widened(
         response_to_disturbances=response,
         of_answers=of_answers,
         extent=extent,
+        curvature=jax.lax.stop_gradient(curvature),
         copies=copies,
     )

@@ -188,19 +188,22 @@ class Factor:
 
 
 def scale(
-    P: Array, A: Array, balls: tuple[int, ...] = ()
+    P: Array, A: Array, balls: tuple[int, ...] = (), curvature: Array | None = None
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Coordinates z = T w and row scale E with T'PT ≈ I and rows of E A T of length one.
 
     Variables first get units of their own (`units`); then T is the inverse transposed Cholesky
-    factor of P + δI. T'PT stays exact.
+    factor of P + δI. T'PT stays exact. curvature (n,): added to P's diagonal for T, for variables
+    without a cost of which more is known than P and A say; None: of none.
     Returns T, E, T'PT, E A T and whether P is singular. A zero row keeps scale 0: it constrains
     nothing in z. The rows of a ball share one scale, so that it stays one.
     """
     n, dtype = P.shape[0], P.dtype
-    unit = jax.lax.stop_gradient(units(jnp.diag(P), A))
-    P_1, A_1 = unit[:, None] * P * unit, A * unit
+    metric = P if curvature is None else P + jnp.diag(curvature)
+    unit = jax.lax.stop_gradient(units(jnp.diag(metric), A))
+    P_1, A_1 = unit[:, None] * metric * unit, A * unit
     delta, flat = null_curvature(*jax.lax.stop_gradient((P_1, A_1)))
+    flat = flat if curvature is None else flat | jnp.any(curvature > 0)
     T = unit[:, None] * inverse_root(P_1 + delta * jnp.eye(n, dtype=dtype)).T
     H = matmul(T.T, matmul(P, T))
     rows = matmul(A, T)
@@ -286,11 +289,18 @@ def null_curvature(P: Array, A: Array) -> tuple[Array, Array]:
     return jnp.maximum(jnp.where(singular, delta, 0.0), least * mean), singular
 
 
-def factorise(P: Array, A: Array, solver: ADMM, balls: tuple[int, ...] = ()) -> Factor:
-    """Return the `Factor` of P (n, n) and A (m, n) at the penalties of `solver`."""
+def factorise(
+    P: Array,
+    A: Array,
+    solver: ADMM,
+    balls: tuple[int, ...] = (),
+    curvature: Array | None = None,
+) -> Factor:
+    """Return the `Factor` of P (n, n) and A (m, n) at the penalties of `solver`; curvature (n,) as
+    in `scale`."""
     fault = matrix_fault(P, A)
     P, A = harmless_matrices(P, A, fault == Status.NOT_RUN)
-    T, E, H, A_w, flat = scale(P, A, balls)
+    T, E, H, A_w, flat = scale(P, A, balls, curvature)
     n, m = A_w.shape[1], A_w.shape[0]
     rho = default_rho(E, n) if solver.rho is None else jnp.asarray(solver.rho, P.dtype)
     rho = jnp.broadcast_to(rho, (rho.shape[0] if rho.ndim == 2 else 1, m))

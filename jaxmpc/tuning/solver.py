@@ -33,7 +33,7 @@ from jaxmpc.mpc.condense import Condensed, condensed_in_float64
 from jaxmpc.mpc.plan import Plan, WarmStart, checked_array
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import pytree
-from jaxmpc.qp.admm import ADMM, ScaledProgram, factorise, iterate, read, splittings
+from jaxmpc.qp.admm import ADMM, ScaledProgram, iterate, read, splittings
 from jaxmpc.qp.problem import QP
 from jaxmpc.qp.residuals import residual_terms, with_fault
 from jaxmpc.qp.solve import solve_factored, warm
@@ -110,7 +110,7 @@ def tune_solver(
     given, c = replace(solver, iterations=iterations), objective.condensed
     if solver.rho is None:
         with jax.enable_x64(True):
-            given = replace(given, rho=float(factorise(c.P, c.C, solver, c.balls).rho[0, 0]))
+            given = replace(given, rho=float(c.factor(solver).rho[0, 0]))
     decides: dict[str, Any] = {
         "version": VERSION,
         "iterations": int(iterations),
@@ -329,7 +329,7 @@ class PenaltyObjective:
         """Return e (B,): log10 of the norm of all residuals over their tolerances."""
         rho, alpha = jnp.exp(theta["log_rho"] @ self.W.T), 2 * jax.nn.sigmoid(theta["alpha"])
         solver, c = replace(self.solver, rho=rho, alpha=alpha), self.condensed
-        made = factorise(c.P, c.C, solver, c.balls)
+        made = c.factor(solver)
         eps = solver.eps
 
         def one(sample: Samples) -> Array:
@@ -399,7 +399,7 @@ def _solve_batch(
 ) -> tuple[Array, Array]:
     """Return status and largest residual (B,) of a batch, in JAX."""
     c, solver = objective.condensed, replace(objective.solver, rho=rho, alpha=alpha)
-    made = factorise(c.P, c.C, solver, c.balls)
+    made = c.factor(solver)
 
     def one(sample: Samples) -> tuple[Array, Array]:
         s = with_fault(*solve_factored(objective.qp(sample.x), made, solver, sample.start))
