@@ -55,7 +55,7 @@ def choose_steps(
 
     lower, upper: corners (n,) of the box of initial states. iterations: the number of steps, where
     that is given; None: the least of 60, 120, 240, ... that will do, 1,920 at most. Under affine
-    policies and tubes, whose QPs take long to try, the penalties stay the usual ones.
+    policies and tubes, whose QPs take long to try, all penalties are moved at once, one time.
     share: of the plans that have a solution, which should be solved. plans: of the closed loops
     that are looked at. tolerance: as in `export_c`. seed: of the initial states; those by which
     `check_fixed_steps` then measures the result are others. progress: print each number of
@@ -79,7 +79,7 @@ def choose_steps(
         kinds = np.repeat(np.arange(len(layout)), [len(ks) * size for _, ks, size in layout])
         rho, alpha = np.asarray(precise.factor.rho)[0], ADMM().alpha
         if isinstance(precise.condensed, PolicyCondensed):
-            kinds, alpha = kinds[:0], ALPHA_OF_POLICIES
+            kinds, alpha = np.zeros(len(rho), int), ALPHA_OF_POLICIES
         steps = FEWEST if iterations is None else iterations
         begun = time.monotonic()
 
@@ -110,8 +110,7 @@ def _improved(
 ) -> tuple[np.ndarray, float]:
     """Return better penalties (rows,) than rho, and the share of plans that they solve.
 
-    make: penalties to controller. length: of the closed loops from `starts`. kinds: of the rows,
-    none to leave the penalties as they are.
+    make: penalties to controller. length: of the closed loops from `starts`. kinds: of the rows.
     """
 
     @jax.jit
@@ -128,11 +127,8 @@ def _improved(
         loop = lambda x: jax.lax.scan(step, (x, controller.start(x)), length=length)[1]
         return jnp.mean(jax.vmap(loop)(jnp.asarray(starts)).astype(float))
 
-    if not len(kinds):
-        one = jax.tree.map(lambda v: v[None], make(jnp.asarray(rho)))
-        return rho, float(solved(one)[0])
     share = 0.0
-    for _ in range(ROUNDS):
+    for _ in range(ROUNDS if kinds.max(initial=0) else 1):
         before = rho
         for kind in range(kinds.max(initial=-1) + 1):
             tried = np.where(kinds == kind, FACTORS[:, None], 1.0) * rho

@@ -161,16 +161,20 @@ def test_status_is_true_and_bad_states_are_answered(tmp_path):
 @compiled
 @pytest.mark.slow
 @pytest.mark.parametrize("policy", ["affine", "tube"])
-def test_many_steps_solve_plans_under_policies(policy, tmp_path):
+def test_some_hundred_steps_solve_plans_under_policies(policy, tmp_path):
+    """From cold, at random states; the section of the tube has 124 generators, of 0.1 to 4e-13."""
     mpc = robust(policy)
-    code = Compiled(mpc, jm.ADMM(iterations=4000, newton_steps=0), tmp_path)
+    code = Compiled(mpc, jm.ADMM(iterations=480, alpha=1.6, newton_steps=0), tmp_path)
+    x0s = np.random.default_rng(0).uniform([-1.0, -1.0], [1.0, 1.5], (100, 2))
     with jax.enable_x64(True):
         controller = jm.Controller(mpc)
-        for x0 in ([0.3, -0.2], [-0.5, 0.6], [0.6, 0.4]):
-            best = controller.plan(x0)
-            u, status = code.step(x0)
-            assert best.solved and (status == 1 or policy == "tube")
-            np.testing.assert_allclose(u, best.inputs[0], atol=1e-5)
+        best = jax.jit(jax.vmap(controller.plan))(x0s)
+    found = [code.step(x0) for x0 in x0s]
+    possible, solved = np.array(best.solved), np.array([status == 1 for _, status in found])
+    assert possible.sum() > 90 and not np.any(solved & ~possible)
+    assert np.sum(possible & ~solved) <= 5
+    errors = np.array([u for u, _ in found]) - np.asarray(best.inputs[:, 0])
+    np.testing.assert_allclose(errors[solved], 0, atol=1e-5)
     assert code.step([2.0, 0.0])[1] == 2  # beyond the limits of x_0
 
 

@@ -2,6 +2,7 @@
 disturbances (DAQP), all sequences in open and in closed loop, and the labels of maps."""
 
 import itertools
+from dataclasses import replace
 
 import daqp
 import jax
@@ -191,6 +192,28 @@ def least_first_inputs(mpc: jm.MPC, states: np.ndarray) -> np.ndarray:
         found = linprog(np.eye(rows.shape[1])[0], rows, bounds, bounds=(None, None))
         least.append(found.fun if found.status == 0 else np.inf)
     return np.array(least)
+
+
+@pytest.mark.parametrize("policy", ["affine", "tube"])
+def test_units_play_no_part(policy):
+    """The steps of ADMM, in scaled rows, are those of the problem in other units of states, input
+    and cost, and with longer rows of the terminal set."""
+    mpc = robust(policy)
+    S, s, cost = np.diag([1e3, 1.0]), 1e2, 1e4
+    back = np.linalg.inv(S)
+    scaled = lambda box, by: jm.Box(by * np.asarray(box.lower), by * np.asarray(box.upper))
+    of_states = lambda box: scaled(box, np.diag(S))
+    last = mpc.terminal_set
+    other = replace(
+        mpc, system=jm.LinearSystem(S @ A @ back, S @ B / s), Q=cost * back @ back,
+        R=0.1 * cost / s**2, terminal_cost=cost * back @ np.asarray(mpc.terminal_cost) @ back,
+        states=of_states(X), inputs=scaled(U, s), disturbance=of_states(W),
+        terminal_set=jm.Polytope(0.01 * np.asarray(last.H) @ back, 0.01 * np.asarray(last.h)),
+    )  # fmt: skip
+    with enable_x64():
+        factors = [jm.Controller(each).factor for each in (mpc, other)]
+        one, two = (f.A @ f.F[0] for f in factors)
+        np.testing.assert_allclose(two, one, rtol=1e-5, atol=1e-6)
 
 
 def test_rows_of_tubes_have_a_solution_where_the_map_says_so():
