@@ -99,7 +99,8 @@ def worst_rows(mpc: jm.MPC, x: np.ndarray, u: np.ndarray) -> float:
 def labelled(mpc: jm.MPC) -> tuple[np.ndarray, np.ndarray]:
     hull = policy_hull(problem_of(mpc))
     ends, center = hull.bounds.points[:8], hull.rays.center
-    scales = (0.5, 1 - 1e-5, 1 + 1e-5, 1.1)
+    # From 1 + 1e-5 on one row of some states is violated by 7e-7, which the tolerance allows.
+    scales = (0.5, 1 - 1e-5, 1 + 2e-5, 1.1)
     states = np.concatenate([STATES, *(center + t * (ends - center) for t in scales)])
     return states, jm.map_feasible_set(mpc, states).label
 
