@@ -1,7 +1,7 @@
 """Plans far outside their limits, where Newton steps on the active rows cycle."""
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import cvxpy as cp
 import jax
@@ -12,7 +12,12 @@ from jax import enable_x64
 
 import jaxmpc as jm
 from jaxmpc.mpc import Plan, solve_stagewise
+from jaxmpc.mpc.plan import Aim
 from jaxmpc.mpc.problem import soften
+from jaxmpc.mpc.stagewise.newton_steps import INTERIOR_STEPS, Search
+from jaxmpc.mpc.stagewise.solve import row_scale
+from jaxmpc.mpc.stagewise.stages import Stages, measured_pair
+from jaxmpc.qp.admm import default_rho
 
 N, n, m, COUNT = 12, 4, 2, 48
 SOLVER = jm.ADMM(iterations=0)
@@ -99,6 +104,36 @@ def test_costs_are_those_of_another_solver():
     worst = np.argsort(-plan.slack.max(axis=(1, 2)))[[0, 1, COUNT // 2]]
     for i in worst:
         assert plan.cost[i] == pytest.approx(least_cost(MPC, int(i)), rel=1e-5)
+
+
+@pytest.mark.slow
+def test_steps_go_on_beside_a_pair_that_is_nearly_solved():
+    """The method begins far off, whatever is known: that what it begins with is as near as 1e-5 is
+    no reason to end it."""
+    with enable_x64(True):
+        x0 = jnp.asarray(instances()[-1][0])
+        still = Aim(x0, jnp.zeros((N + 1, n)), jnp.zeros((N, m)), jnp.zeros(m))
+        s, eps = Stages.of(MPC).aimed(still), jnp.asarray(1e-6)
+        E = row_scale(s)
+        fixed = jnp.where(E == 0, s.bounds.penalty_gradient(s.rows(*still[1:3])), 0.0)
+        rho = jnp.broadcast_to(default_rho(E, N * m), E.shape)
+
+        def loop(step, most, constants, state):
+            if not most:  # no Newton steps before, which would solve it
+                return state
+            return jax.lax.while_loop(lambda state: state.open, partial(step, constants), state)
+
+        @jax.jit
+        def found(u, y):
+            begin, yes = measured_pair(eps, s, u, y), jnp.asarray(True)
+            return begin, Search(0, INTERIOR_STEPS, loop).from_pair(
+                s, E, rho, fixed, eps, begin, yes
+            )
+
+        _, cold = found(jnp.zeros((N, m)), jnp.zeros_like(E))
+        near, warm = found(cold.z * (1 + 1e-8), cold.y)
+        assert cold.measured.within_tolerance and warm.measured.within_tolerance
+        assert 1e-6 < near.error < 1e-3
 
 
 @pytest.mark.slow

@@ -61,7 +61,7 @@ INTERIOR_STEPS = 40
 # Slack of the first step at least, in scaled rows; part of the way to the boundary that is taken;
 # and the part of a step below which the iterates have come to rest.
 LEAST_SLACK, FRACTION, REST = 1e-2, 0.995, 1e-8
-# Where rounding stops the method: the residuals, once below BEGUN, grow LOST times.
+# Where rounding stops the method: its own residuals, once below BEGUN, grow LOST times.
 BEGUN, LOST = 1e-3, 100.0
 # Of a proximal term on the multipliers: weights of 1e11 and more would be lost in rounding.
 DAMPING = 1e-11
@@ -204,8 +204,8 @@ class Limits(NamedTuple):
 @pytree
 class SearchState:
     """Loop state of one instance: inputs u (N, m), multipliers y (rows,) or, of the interior point
-    method, the sides' numbers, the rows and the gradient (N, m) of the Lagrangian, the best pair of
-    all so far, the steps taken, and whether to go on."""
+    method, the sides' numbers, the rows, the gradient (N, m) of the Lagrangian and the least error
+    that it came to itself; the best pair of all so far, the steps taken, and whether to go on."""
 
     u: Array
     dual: Any
@@ -239,7 +239,7 @@ def interior_step(most: int, constants: tuple, state: SearchState) -> SearchStat
     that no input moves, 0 in others, and eps.
     """
     s, E, fixed, eps = constants
-    limits, (at, rows, gradient) = Limits.of(s.bounds.scaled(E)), state.dual
+    limits, (at, rows, gradient, least) = Limits.of(s.bounds.scaled(E)), state.dual
     first = state.steps == 0
     nu, has = limits.nu(at), limits.present
     v = E * rows
@@ -279,9 +279,10 @@ def interior_step(most: int, constants: tuple, state: SearchState) -> SearchStat
     pair = Pair.of(u, y, residuals_of(s, u, y, found), eps, rounding(u.dtype))
     again = pair.measured.within_tolerance & state.best.measured.within_tolerance
     best, steps = state.best.or_better(pair), state.steps + 1
-    lost = (best.error < BEGUN) & (pair.error > LOST * best.error)
+    lost = (least < BEGUN) & (pair.error > LOST * least)
     wanted = ~(best.near | best.finished | again | lost) & sound & (steps < most)
-    return SearchState(u, (at, found.rows, found.gradient), best, steps, wanted)
+    dual = at, found.rows, found.gradient, jnp.minimum(least, pair.error)
+    return SearchState(u, dual, best, steps, wanted)
 
 
 class Search(NamedTuple):
@@ -303,7 +304,8 @@ class Search(NamedTuple):
             return best
         blank = jnp.zeros((2, len(best.y)), best.y.dtype)
         found = conditions(s, best.z, fixed)
-        dual = Sides(blank, blank, blank), found.rows, found.gradient
+        least = jnp.asarray(jnp.inf, best.y.dtype)
+        dual = Sides(blank, blank, blank), found.rows, found.gradient, least
         begun = SearchState.begin(best, dual)
         begun = replace(begun, open=begun.open & wanted)
         step = partial(interior_step, self.interior)
