@@ -16,6 +16,10 @@ for the status of a plan is computed from A, B, c, the weights and the rows them
                which the cost is ½|w|² + const, it is how far the plan is from the best one for the
                multipliers y; it is compared with √(2J);
     gap        Σ (penalty + conjugate − y v), how far y is from complementary, relative to J.
+
+The solver stops by the terms of its QP. With references it solves for the change from them, so that
+these terms are tracking errors too. The inputs that hold a robot at its set-point are far larger: a
+plan that is right beside them need not be right beside the errors.
 """
 
 from collections.abc import Callable
@@ -307,11 +311,16 @@ def planned_from(controller: Controller, aim: Aim, start: WarmStart | None, *, w
             previous_input=jnp.zeros(m, theta.dtype) if previous is None else previous
         )
         theta = jnp.concatenate([theta, aim.previous_input])
-    qp = _qp(controller, theta, aim)
+    qp, z0 = _qp(controller, theta, aim), _tracked(c, aim)
+    if z0 is not None:
+        qp = qp.about(z0)
     pair = None
     if start is not None and not isinstance(c, PolicyCondensed):
-        pair = c.variables(start.states, start.inputs), start.multipliers
+        z = c.variables(start.states, start.inputs)
+        pair = z if z0 is None else z - z0, start.multipliers
     found, fault = solve_factored(qp, controller.factor, controller.solver, pair, whole=whole)
+    if z0 is not None:
+        found = replace(found, z=z0 + found.z)
     fault = jnp.where(finite, fault, Status.NON_FINITE)
     return planned(controller, theta, aim, found, fault)
 
@@ -319,6 +328,16 @@ def planned_from(controller: Controller, aim: Aim, start: WarmStart | None, *, w
 _plan = compiled_lightly(1, static_argnames="whole")(planned_from)
 # Of `solve`, which makes a controller for each plan: that takes more time than the plan.
 _plan_once = compiled_lightly(0, static_argnames="whole")(planned_from)
+
+
+def _tracked(c: Condensed, aim: Aim) -> Array | None:
+    """Return the variables (nz,) of the references, about which the QP is solved; None where there
+    are no references, and under affine policies and tubes."""
+    if isinstance(c, PolicyCondensed) or (aim.states is None and aim.inputs is None):
+        return None
+    states = jnp.zeros_like(c.phi) if aim.states is None else aim.states
+    inputs = jnp.zeros_like(c.psi) if aim.inputs is None else aim.inputs
+    return c.variables(states, inputs)
 
 
 def _qp(controller: Controller, theta: Array, aim: Aim) -> QP:

@@ -31,6 +31,7 @@ from jaxmpc.checks import (
     require_symmetric_psd,
 )
 from jaxmpc.pytrees import named_pytree, pytree, static
+from jaxmpc.qp.linalg import matmul
 from jaxmpc.qp.status import WithStatus
 
 # What leaves a row free: l, u, linear and quadratic.
@@ -322,6 +323,13 @@ class QP:
         if linear is not None and quadratic is None:
             quadratic = jnp.zeros_like(linear)
         return Bounds(self.l, self.u, linear, quadratic, self.radius, self.balls)
+
+    def about(self, z: Array) -> "QP":
+        """Return the program in the change from z (n,), whose cost leaves out that of z."""
+        Az = matmul(z, self.A.T)
+        extent = None if self.extent is None else self.extent + jnp.abs(z)
+        q = self.q + matmul(z, self.P)
+        return replace(self, q=q, l=self.l - Az, u=self.u - Az, extent=extent)
 
     @classmethod
     def from_qpsolvers(

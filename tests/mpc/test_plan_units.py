@@ -368,3 +368,30 @@ def test_plans_that_rest_at_a_soft_limit():
             plan, other = (jm.solve(mpc, x0, reference=aim) for mpc in (soft, hard))
             assert plan.status == other.status == jm.Status.SOLVED
             np.testing.assert_allclose(plan.states, other.states, atol=1e-7)
+
+
+@pytest.mark.slow
+def test_plans_near_a_set_point_are_those_near_zero():
+    """A set-point on soft limits, whose inputs carry a load, is a problem without load, moved.
+    Near it tracking errors are 1e-12 of states and inputs; the solver is to stop by the former."""
+    n, h, rng = 3, 0.01, np.random.default_rng(0)
+    M = rng.normal(size=(n, n))
+    push = 20 * np.linalg.inv(M @ M.T + 0.1 * np.eye(n))
+    A, B = np.eye(2 * n) + h * np.eye(2 * n, k=n), np.vstack([h * h * push, h * push])
+    x, u = np.append([1.0, *rng.uniform(-1, 1, 2)], np.zeros(n)), rng.uniform(3, 8, n)
+    room = np.array([0.0, 0.0, 1.9, 5, 5, 5])
+
+    def problem(x, u):
+        soft = jm.mpc.Soft(np.eye(2 * n), upper=x + room, rho=1e4)
+        limits, weights = jm.Box(u - 18.0, u + 4.0), ([100.0] * n + [1.0] * n, [0.01] * n)
+        system = jm.LinearSystem(A, B, x - A @ x - B @ u)
+        return jm.MPC(system, *weights, 6, inputs=limits, soft=soft)
+
+    with jax.enable_x64(True):
+        loaded, free = (jm.Controller(problem(*at)) for at in ((x, u), (0 * x, 0 * u)))
+        for off in 10.0 ** np.repeat([-9, -11, -12], 8)[:, None] * rng.normal(size=(24, 2 * n)):
+            plan, moved = loaded.plan(x + off, x, None, u), free.plan(off, 0 * x, None, 0 * u)
+            assert plan.status == moved.status == jm.Status.SOLVED
+            np.testing.assert_allclose(
+                plan.inputs - u, moved.inputs, atol=1e-6 * abs(off).max() + 1e-11
+            )
