@@ -258,6 +258,19 @@ def test_residuals_are_those_of_the_qp():
     assert min(found) > 1e-4
 
 
+@pytest.mark.parametrize(("off", "within"), [(1e-8, True), (1e-4, False)])
+def test_gradient_without_active_rows_is_compared_with_its_terms(off, within):
+    """One step x + u, cost 2 u² + 3 (x + u)², no limits: u = −0.6 x, where the gradient is the
+    difference of two terms of 2.4 x. An input off by 1e-8 is good to 1e-6; one off by 1e-4 not."""
+    system = jm.LinearSystem(np.eye(1), np.eye(1))
+    mpc = jm.MPC(system, np.zeros((1, 1)), 2 * np.eye(1), 1, terminal_cost=3 * np.eye(1))
+    aim = Aim(jnp.array([0.7]), jnp.zeros((2, 1)), jnp.zeros((1, 1)), jnp.zeros(1))
+    s, u = stages.Stages.of(mpc).aimed(aim), jnp.array([[-0.42 * (1 + off)]])
+    pair = stages.measured_pair(jnp.asarray(1e-6), s, u, jnp.zeros(0))
+    np.testing.assert_allclose(pair.measured.dual, 10 * 0.42 * off, rtol=1e-6)
+    assert pair.measured.within_tolerance == within
+
+
 @pytest.mark.slow
 def test_rows_that_no_input_moves():
     """x_0 outside hard limits: violated, and said; outside soft ones: their slack."""

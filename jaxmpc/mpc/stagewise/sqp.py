@@ -6,7 +6,8 @@ f(x_k, u_k) − x_{k+1}. The step to the QP's solution is shortened until the me
 
     φ = J + penalties of soft rows + Σ w |defect| + Σ w (violation of hard rows)
 
-falls by a part of what the QP predicts (Armijo). It is exact where each weight w exceeds its
+falls by a part of what the QP predicts (Armijo), after a second-order correction of the states
+where the whole step does not lower it. φ is exact where each weight w exceeds its
 multiplier; Powell's rule, w ← max(|λ|, (w + |λ|)/2), keeps that with λ of the QP (Nocedal, Wright
 2006, §18.3). One QP a time step, with a full step from the last plan shifted by one, is the
 real-time iteration (Diehl, Bock, Schlöder 2005).
@@ -275,8 +276,8 @@ class Merit:
 
     def value(
         self, s: Stages, base: Stages, problem: NonlinearMPC, x: Array, u: Array
-    ) -> tuple[Array, Array]:
-        """Return φ at x, u, and the sum of its terms' sizes; s: an expansion."""
+    ) -> tuple[Array, Array, Array]:
+        """Return φ at x, u, the sum of its terms' sizes, and the defects; s: an expansion."""
         rows = rows_of(s, base, problem, x, u)
         gap = jax.vmap(problem.model.step)(x[:-1], u) - x[1:]
         parts = [
@@ -285,7 +286,7 @@ class Merit:
             jnp.sum(self.defects * jnp.abs(gap)),
             jnp.sum(self.rows * jnp.abs(s.bounds.violation(rows))),
         ]
-        return jnp.sum(jnp.stack(parts)), jnp.sum(jnp.abs(jnp.stack(parts)))
+        return jnp.sum(jnp.stack(parts)), jnp.sum(jnp.abs(jnp.stack(parts))), gap
 
     def decrease(self, s: Stages, dx: Array, du: Array) -> Array:
         """Return by how much φ falls along the whole step dx, du in the expansion."""
@@ -402,30 +403,59 @@ def sqp_step(most: int, hessian: str, constants: tuple, state: Iterate) -> Itera
     dx, du, dy = predict(s, u_qp) - x, u_qp - u, y_qp - y
 
     merit = state.merit.raised(costates(s, u_qp, y_qp)[1:], y_qp)
-    length, found, predicted, slack = line_search(merit, s, base, problem, dx, du)
-    go = ~solved & found & jnp.all(jnp.isfinite(du))
+    search, predicted, slack = line_search(merit, s, base, problem, dx, du)
+    go = ~solved & search.found & jnp.all(jnp.isfinite(du))
     go = go & (~exact | (usable & (predicted > -slack)))
-    step = lambda v, d: v + jnp.where(go, length * d, 0.0)
+    length = search.length
+    step = lambda v, d: v + jnp.where(go, d, 0.0)
+    x, u, y = step(x, search.dx), step(u, length * du), step(y, length * dy)
     count = state.steps + ~solved
     exact_next, open_ = go & usable & (length == 1), ~solved & (go | exact) & (count < most)
-    return Iterate(step(x, dx), step(u, du), step(y, dy), merit, count, exact_next, open_)
+    return Iterate(x, u, y, merit, count, exact_next, open_)
+
+
+@pytree
+class LineSearch:
+    """Loop state of a line search: the part of the step that was tried last, the states' step
+    (N+1, n) for it, what closes its defects (N+1, n), the attempts made, and whether it is good."""
+
+    length: Array
+    dx: Array
+    correction: Array
+    attempt: Array
+    found: Array
 
 
 def line_search(
     merit: Merit, s: Stages, base: Stages, problem: NonlinearMPC, dx: Array, du: Array
-) -> tuple[Array, Array, Array, Array]:
-    """Return the part of the step dx, du that is long enough and lowers the merit by a part of what
-    the expansion predicts, whether there is one, the decrease predicted, and its rounding."""
+) -> tuple[LineSearch, Array, Array]:
+    """Return where the search for a step along dx, du ends that lowers the merit by a part of what
+    the expansion predicts, the decrease predicted, and its rounding.
+
+    The whole step is tried first, then the same inputs with the states moved by what closes its
+    defects to first order, then half the step and so on. Near a solution the defects of whole
+    steps, second-order terms times large weights, exceed what the cost gains (Maratos 1978; the
+    correction: Nocedal, Wright 2006, §18.3).
+    """
     x, u = s.aim.states, s.aim.inputs
     value = partial(merit.value, s, base, problem)
-    (now, size), predicted = value(x, u), merit.decrease(s, dx, du)
+    (now, size, _), predicted = value(x, u), merit.decrease(s, dx, du)
     slack = 10 * jnp.finfo(x.dtype).eps * size
-    enough = lambda a: value(x + a * dx, u + a * du)[0] <= now - DECREASE * a * predicted + slack
-    shorten = lambda search: (search[0] / 2, enough(search[0] / 2))
-    go_on = lambda search: ~search[1] & (search[0] > SHORTEST)
-    one = jnp.ones((), x.dtype)
-    length, found = jax.lax.while_loop(go_on, shorten, varying((one, enough(one)), x))
-    return length, found, predicted, slack
+
+    def attempt(search: LineSearch) -> LineSearch:
+        k = search.attempt
+        length = jnp.where(k < 2, 1.0, search.length / 2)
+        moved = length * dx + jnp.where(k == 1, search.correction, 0.0)
+        after, _, gap = value(x + moved, u + length * du)
+        found = after <= now - DECREASE * length * predicted + slack
+        closing = recurrence(s.A, gap, jnp.zeros_like(x[0]))
+        correction = jnp.concatenate([jnp.zeros_like(x[:1]), closing])
+        return LineSearch(length, moved, correction, k + 1, found)
+
+    one, none = jnp.ones((), x.dtype), jnp.zeros_like(dx)
+    begin = LineSearch(one, none, none, jnp.int32(0), jnp.asarray(False))
+    go_on = lambda search: ~search.found & (search.length > SHORTEST)
+    return jax.lax.while_loop(go_on, attempt, varying(begin, x)), predicted, slack
 
 
 def solved_qp(

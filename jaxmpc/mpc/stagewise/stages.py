@@ -323,7 +323,7 @@ def conditions(s: Stages, u: Array, y: Array) -> Optimality:
     # The rounding of a costate is that of others too, as of a speed's that of its position.
     later = later + apply_transposed(absolute.A, later)
     back_terms = later + jnp.abs(of_cost) + jnp.abs(of_rows)
-    cost_part = jnp.abs(own + apply_transposed(s.B, of_cost))
+    cost_part = jnp.abs(own) + apply_transposed(absolute.B, jnp.abs(of_cost))
     row_part = jnp.abs(pushed + apply_transposed(s.B, of_rows))
     return Optimality(
         rows=s.rows(x, u),
