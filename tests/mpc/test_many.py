@@ -88,8 +88,9 @@ def test_no_states_and_wrong_shapes():
 def test_solved_and_sentence():
     """Of one plan, and of many: one truth value each, and a print of a few lines."""
     mpc = problems.joint_o_inf(10)
-    plans = jm.solve_many(mpc, np.array([[0.1, 0.0], [1.6, 2.1], [0.0, 0.0]]), chunk=1)
-    np.testing.assert_array_equal(plans.solved, [True, False, True])
+    some = np.resize([[0.1, 0.0], [1.6, 2.1], [0.0, 0.0]], (200, 2))
+    plans = jm.solve_many(mpc, some, chunk=200)  # the program of `plans`
+    np.testing.assert_array_equal(plans.solved, np.resize([True, False, True], 200))
     plan = jax.tree.map(lambda v: v[0], plans)
     assert plan.solved and plan.sentence == jm.Status.SOLVED.sentence
     with pytest.raises(ValueError, match="sentence: of"):
