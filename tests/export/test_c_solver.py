@@ -128,7 +128,7 @@ def test_closed_loop_is_the_controllers(case, tmp_path):
         A, B = (np.asarray(v)[0] if v.ndim == 3 else np.asarray(v) for v in (system.A, system.B))
         for start, reference, effort in ((0.5, None, None), (1.2, 0.3, 0.1)):
             x = np.full(system.n, start)
-            control = law.start(x)  # zeros, as the memory: one program serves the first step too
+            control = None  # cold, as the code after a reset: not from a plan of zeros
             code.memory[:] = 0
             target = None if reference is None else np.full(system.n, reference)
             input_target = None if effort is None else np.full(system.m, effort)
