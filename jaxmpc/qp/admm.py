@@ -68,9 +68,9 @@ CENTRINGS = 30
 class ADMM:
     """Settings of the solver.
 
-    iterations: ADMM steps, always all of them; None: 50, and 10 from a warm start where Newton
-    steps follow. One instance from plain Python that has a warm start and that Newton steps solve
-    without them takes none.
+    iterations: ADMM steps, always all of them; None: 50, but where Newton steps follow 10 from a
+    warm start and 20 in `solve_stagewise`. One instance from plain Python that has a warm start
+    and that Newton steps solve without them takes none.
     rho: penalty of the scaled rows (each of length 1 in the metric of the Hessian); None:
     √(min(1, n/m)), m counting the rows that z moves; or a number, one value a row (m,), or a
     schedule (stages, m) or (stages, 1) whose stages have equally many iterations.
@@ -143,12 +143,12 @@ class ADMM:
             fail("differentiate", f"{self.differentiate!r}", 'Give "implicit" or "unrolled"')
         number("smoothing", self.smoothing, 0, "Give 0 (none) or a positive number")
 
-    def admm_steps(self, warm: bool = False) -> int:
-        """Return how many ADMM steps there are. warm: there is a warm start."""
+    def admm_steps(self, few: int = ADMM_STEPS) -> int:
+        """Return how many ADMM steps there are. few: so many serve where Newton steps follow."""
         if self.iterations is not None:
             return self.iterations
-        few = warm and self.most_newton_steps() > 0 and self.differentiate != "unrolled"
-        return WARM_STEPS if few and np.ndim(self.rho) < 2 else ADMM_STEPS
+        followed = self.most_newton_steps() > 0 and self.differentiate != "unrolled"
+        return few if followed and np.ndim(self.rho) < 2 else ADMM_STEPS
 
     def most_newton_steps(self, default: int = 1000) -> int:
         """Return how many Newton steps there are at most: `newton_steps`, or where that is None

@@ -142,9 +142,9 @@ def call(
     return run
 
 
-def padded_side(n: int) -> int:
-    """Return the least power of two that holds n, at least LEAST."""
-    return max(1 << (n - 1).bit_length(), LEAST)
+def padded_side(n: int, least: int = LEAST) -> int:
+    """Return the least power of two that holds n, at least `least`."""
+    return max(1 << (n - 1).bit_length(), least)
 
 
 def indices(count: int) -> Array:
@@ -159,6 +159,8 @@ def program() -> Array:
 
 def dot(a: Array, b: Array, product: Product) -> Array:
     """Return the product of two matrices; product: EXACT or ROUGH, for float32 on tensor cores."""
+    if min(*a.shape, *b.shape) < LEAST:
+        return jnp.sum(a[:, :, None] * b[None, :, :], axis=1)
     return lax.dot_general(
         a, b, (((1,), (0,)), ((), ())), precision=product, preferred_element_type=a.dtype
     )

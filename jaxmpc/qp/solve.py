@@ -20,7 +20,9 @@ from jaxmpc.arrays import Reals
 from jaxmpc.checks import concrete, fail, require_kind, require_shape
 from jaxmpc.qp.admm import (
     ADMM,
+    ADMM_STEPS,
     DEFAULT,
+    WARM_STEPS,
     Factor,
     ScaledProgram,
     factorise,
@@ -136,7 +138,7 @@ def solve_factored(
     else:
         found = search(clean, factor, solver, warm_start, whole)
         z, y = found.z, found.y
-    steps = jnp.int32(solver.admm_steps(warm_start is not None))
+    steps = jnp.int32(admm_steps(solver, warm_start))
     return replace(found, z=z, y=y, cost=value(clean, z, y), iterations=steps), fault
 
 
@@ -151,9 +153,14 @@ def search(
     if most and not unrolled:
         return refined_end(p, solver, begin, whole)
     found = stepped_end(p, begin, most)
-    if most or not solver.admm_steps(warm_start is not None):
+    if most or not admm_steps(solver, warm_start):
         return found
     return or_inaccurate(found, begin, solver.dtype or p.q.dtype)
+
+
+def admm_steps(solver: ADMM, warm_start: WarmPair) -> int:
+    """Return how many ADMM steps there are."""
+    return solver.admm_steps(ADMM_STEPS if warm_start is None else WARM_STEPS)
 
 
 def admm_end(
@@ -167,7 +174,7 @@ def admm_end(
         t = nearer(splittings(factor, q)[0], bounds, warm(p, warm_start))
     own = q.dtype
     dtype = jnp.dtype(solver.dtype or ("float32" if refined else own))
-    steps = solver.admm_steps(warm_start is not None)
+    steps = admm_steps(solver, warm_start)
     product = ROUGH if refined else EXACT
     constants, data = cast(((factor, jnp.asarray(solver.alpha)), (q, bounds, t)), dtype)
     if solver.differentiate == "unrolled":

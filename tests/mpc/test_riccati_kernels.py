@@ -41,7 +41,7 @@ def test_kernels_equal_the_scans(staged):
     found, gains = both(kernels._riccati_scan, kernels._riccati_kernel, Q, R, A, B)
     close(found, gains)
     scan = functools.partial(kernels._tracking_by, kernels._scan)
-    close(*both(scan, kernels._tracking_kernel, *gains, A, B, gx, gu))
+    close(*both(scan, kernels._tracking_kernel, gains, A, B, gx, gu))
     for adjoint in (False, True):
         scan = lambda *a, adjoint: kernels._scan(*a, adjoint=adjoint, unroll=1)
         close(*both(scan, kernels._recurrence_kernel, A, gx[:, 1:], gx[:, 0], adjoint=adjoint))
@@ -66,7 +66,7 @@ def test_recurrences_in_pieces_are_the_scan(N, staged, adjoint):
             run = lambda f, axes=axes, given=given: jax.vmap(
                 functools.partial(f, adjoint=adjoint), axes
             )(*map(jnp.asarray, given))
-            found, expected = run(kernels._in_pieces), run(kernels._scan)
+            found, expected = run(kernels._recurrence_in_pieces), run(kernels._scan)
             np.testing.assert_allclose(found, expected, rtol=1e-13, atol=1e-13)
 
 
@@ -80,10 +80,66 @@ def test_covariances_in_pieces_are_those_of_all_stages(monkeypatch):
             moved = [C[k] @ R for R in moved] + [root[k]]
             expected.append(sum(R @ R.T for R in moved))
         given = jnp.asarray(C), jnp.asarray(root @ root.swapaxes(1, 2))
-        for on_gpu in (False, True):
+        for on_gpu, long in ((False, 2), (True, 2), (True, 8)):
             monkeypatch.setattr(kernels, "on_gpu", lambda on_gpu=on_gpu: on_gpu)
-            monkeypatch.setattr(kernels, "LONG", 2)
+            monkeypatch.setattr(kernels, "LONG", long)
             np.testing.assert_allclose(kernels.covariances(*given), expected, rtol=1e-12)
+
+
+@pytest.mark.first(2)
+@pytest.mark.parametrize("kind", ["staged", "one input matrix", "late cost", "units"])
+def test_riccati_recursions_in_pieces_are_the_scan(kind):
+    """Of a plant that is unstable: with weights that a stage may lack, with a cost of the last
+    state alone, and in units that are 10^10 apart."""
+    with jax.enable_x64(True):
+        rng, N, n, m = np.random.default_rng(4), 11, 4, 2
+        A = rng.normal(size=(n, n))
+        A *= 1.2 / np.abs(np.linalg.eigvals(A)).max()
+        B, W = rng.normal(size=(n, m)), rng.normal(size=(N + 1, n, 2))
+        Q, R = W @ W.swapaxes(1, 2), np.eye(m) * 10 ** rng.uniform(-3, 3, (N, 1, 1))
+        if kind == "late cost":
+            Q[:-1] = 0.0
+            Q[-1] += np.eye(n)
+        if kind == "units":
+            unit = 10 ** np.array([-5.0, 5.0, 0.0, 2.0])
+            A, B, Q = unit[:, None] * A / unit, unit[:, None] * B, Q / unit / unit[:, None]
+        if kind == "staged":
+            A, B = A + 0.1 * rng.normal(size=(N, n, n)), B + 0.1 * rng.normal(size=(N, n, m))
+        batch = [jnp.asarray(np.stack([v, 2 * v])) for v in (Q, R)]
+        axes = (0, 0, None, None)
+        found, expected = (
+            jax.vmap(run, axes)(*batch, jnp.asarray(A), jnp.asarray(B))
+            for run in (kernels._riccati_in_pieces, kernels._riccati_scan)
+        )
+        for a, b in zip(found[:3], expected[:3], strict=True):
+            size = jnp.max(jnp.abs(b), axis=2, keepdims=True)
+            np.testing.assert_allclose(a / size, b / size, atol=1e-10)
+
+
+def test_long_horizons_are_divided(monkeypatch):
+    """Tracking by gains with products of their pieces, and its derivatives, are the scan's."""
+    with jax.enable_x64(True):
+        Q, R, A, B, gx, gu = (
+            jnp.asarray(v[0], jnp.float64) for v in batch(np.random.default_rng(6), 5, 3, 2, False)
+        )
+
+        def tracked():
+            def inputs(Q, gx):
+                gains = kernels.riccati_recursion(Q, R, None, A, B)
+                u = kernels.tracking(gains, A, B, gx, gu)[1]
+                return jnp.sum(u**2), (u, gains.products)
+
+            run = jax.jit(jax.value_and_grad(inputs, argnums=(0, 1), has_aux=True))
+            (_, (u, products)), slopes = run(Q, gx)
+            return (u, *slopes), products
+
+        expected, none = tracked()
+        monkeypatch.setattr(kernels, "on_gpu", lambda: True)
+        monkeypatch.setattr(kernels, "LONG", 4)
+        found, products = tracked()
+        assert none is None and products.shape == (2, 3, 3)
+        for a, b in zip(found, expected, strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-12)
 
 
 @pytest.mark.first(1)
@@ -103,7 +159,7 @@ def test_a_batch_side_by_side_is_the_scan(staged):
         for found, wanted in (
             (own(Q, R, A, B), scan(Q, R, A, B)), (nested(Q, R, A, B), expected)
         ):  # fmt: skip
-            for a, b in zip(found, wanted, strict=True):
+            for a, b in zip(*map(jax.tree.leaves, (found, wanted)), strict=True):
                 np.testing.assert_allclose(a, b, rtol=0, atol=1e-12)
         slope = lambda of: jax.jit(jax.grad(lambda A: jnp.sum(of(Q, R, A, B).K ** 3)))(A)
         np.testing.assert_allclose(slope(jax.vmap(chosen)), slope(scan), rtol=1e-10)

@@ -272,7 +272,9 @@ def call_recursions(dtype):
     A, B, Q, R = random(N, n, n), random(N, n, m), weights(N + 1, n, n), weights(N, m, m)
     gains = jax.vmap(recursion_kernels._riccati_kernel)(Q, R, A, B)
     gx, gu = random(N + 1, n), random(N, m)
-    jax.vmap(recursion_kernels._tracking_kernel)(*gains, A, B, gx, gu)
+    jax.vmap(recursion_kernels._tracking_kernel)(gains, A, B, gx, gu)
+    jax.vmap(recursion_kernels._riccati_in_pieces)(Q, R, A, B)
+    jax.vmap(recursion_kernels._recurrence_in_pieces)(A, A @ A, 0 * A[:, 0])
     for adjoint in (False, True):
         again = functools.partial(recursion_kernels._recurrence_kernel, adjoint=adjoint)
         jax.vmap(again, in_axes=(None, 0, 0))(A[0], gx[:, 1:], gx[:, 0])
@@ -294,7 +296,14 @@ def call_recursions(dtype):
         (lambda: call_line_search(True), {"in_registers"}),
         (
             lambda: [call_recursions(dtype) for dtype in (jnp.float32, jnp.float64)],
-            {"riccati_stages", "tracking_stages", "recurrence_stages"},
+            {
+                "riccati_stages",
+                "riccati_pieces",
+                "riccati_ends",
+                "tracking_stages",
+                "recurrence_stages",
+                "products_of_pieces",
+            },
         ),
     ],
     ids=[

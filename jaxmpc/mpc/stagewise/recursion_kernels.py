@@ -6,10 +6,12 @@ the matrices of a batch stand side by side (the batch in the last axis, which XL
 for 14 states, 7 inputs and 20 stages, 67 as a batched scan). Everywhere else, and for derivatives,
 the scans serve.
 
-Long horizons are divided into √N pieces of √N stages on a GPU (`_in_pieces`). In a piece
-y_k = l_k + Φ_k s with the recurrence l from zero, the products Φ of its matrices and its start s:
-all pieces have their l and Φ at once, and their starts follow one from the other, by a recurrence
-of √N stages. (Blelloch's scan of 1990 over partial products has log N steps of larger products.)
+Long horizons are divided on a GPU into √N pieces of √N stages, programs side by side. In a piece a
+recurrence from the start y ends at e + Φy, where e is its end from zero and Φ the product of its
+matrices. So the starts follow one from the other, by a recurrence over √N pieces, and each piece is
+run from its own (`_recurrence_in_pieces`); with one thing more this is true of the Riccati
+recursion (`_riccati_in_pieces`). (Blelloch's scan of 1990 over partial products has log N steps of
+larger products.)
 """
 
 import math
@@ -22,7 +24,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxmpc.qp.jax_transformations import on_gpu, with_derivative_of
-from jaxmpc.qp.kernel import EXACT, barrier, call, dot, indices, load, padded_side, store
+from jaxmpc.qp.kernel import EXACT, barrier, call, dot, indices, load, padded_side, program, store
 from jaxmpc.qp.linalg import WAITS, batched, inverse_root_side_by_side, matmul, solve
 
 # Numbers along a side that a warp's registers hold.
@@ -33,11 +35,12 @@ LONG = 128
 
 class Gains(NamedTuple):
     """What a Riccati recursion leaves: closed A + BK (N, n, n), K (N, m, n), inverse G⁻¹ (N, m, m),
-    G = R + B'SB."""
+    G = R + B'SB; and of a long horizon on a GPU the products (pieces, n, n) of A + BK over each."""
 
     closed: Array
     K: Array
     inverse: Array
+    products: Array | None = None
 
 
 def recurrence(M: Array, w: Array, start: Array, *, adjoint: bool = False) -> Array:
@@ -46,9 +49,9 @@ def recurrence(M: Array, w: Array, start: Array, *, adjoint: bool = False) -> Ar
 
     M (N, n, n), or (n, n) the same at all stages; w (N, n); start (n,).
     """
-    scan = partial(_scan, adjoint=adjoint)
-    kernel = _recurrence_kernel if len(w) < LONG else _in_pieces
-    return _or_kernel(scan, partial(kernel, adjoint=adjoint), M, w, start)
+    kernel = _recurrence_kernel if len(w) < LONG else _recurrence_in_pieces
+    scan, kernel = (partial(run, adjoint=adjoint) for run in (_scan, kernel))
+    return _or_kernel(scan, kernel, M, w, start)
 
 
 def tracking(
@@ -62,8 +65,9 @@ def tracking(
     gx (N+1, n), gu (N, m); A (n, n) and B (n, m), or one a stage.
     """
     scan = partial(_tracking_by, partial(_scan, unroll=unroll))
-    kernel = _tracking_kernel if len(gu) < LONG else partial(_tracking_by, _in_pieces)
-    return _or_kernel(scan, kernel, *gains, A, B, gx, gu)
+    in_pieces = partial(_recurrence_in_pieces, products=gains.products)
+    kernel = _tracking_kernel if len(gu) < LONG else partial(_tracking_by, in_pieces)
+    return _or_kernel(scan, kernel, gains, A, B, gx, gu)
 
 
 def riccati_recursion(Q: Array, R: Array, cross: Any, A: Array, B: Array) -> Gains:
@@ -72,36 +76,25 @@ def riccati_recursion(Q: Array, R: Array, cross: Any, A: Array, B: Array) -> Gai
     Q (N+1, n, n), R (N, m, m), cross M (N, m, n) or None; A (n, n) and B (n, m), or one a stage.
     """
     if cross is not None:
-        return _riccati_scan(Q, R, A, B, cross)
-    return _or_kernel(_riccati_scan, _riccati_kernel, Q, R, A, B, lanes=_riccati_lanes)
+        gains = _riccati_scan(Q, R, A, B, cross)
+    else:
+        kernel = _riccati_kernel if len(R) < LONG else _riccati_in_pieces
+        gains = _or_kernel(_riccati_scan, kernel, Q, R, A, B, lanes=_riccati_lanes)
+    if not on_gpu() or len(R) < LONG or A.shape[-1] > MOST:
+        return gains
+    return gains._replace(products=_products(jax.lax.stop_gradient(gains.closed), len(R)))
 
 
 def covariances(closed: Array, noise: Array) -> Array:
     """Σ (N, n, n) after each stage: Σ⁺ = C Σ C' + W from Σ = 0 with C, W (N, n, n) of the stage."""
-    N, n, _ = closed.shape
-    moved = lambda C, S: matmul(C, matmul(S, jnp.swapaxes(C, -1, -2)))
-
-    def stage(carry: tuple, at: tuple) -> tuple[tuple, tuple]:
-        (S, product), (C, W) = carry, at
-        after = moved(C, S) + W, matmul(C, product)
-        return after, after
-
-    def piece(C: Array, W: Array) -> tuple[Array, Array]:
-        return jax.lax.scan(stage, (jnp.zeros_like(W[0]), jnp.eye(n, dtype=W.dtype)), (C, W))[1]
-
-    if not on_gpu() or N < LONG:
-        return piece(closed, noise)[0]
-    # Pieces side by side, then their starts one from the other, as in `_in_pieces`.
-    local, products = jax.vmap(piece)(_pieces(closed), _pieces(noise))
-    advance = lambda S, end: (moved(end[1], S) + end[0], S)
-    starts = jax.lax.scan(advance, jnp.zeros_like(noise[0]), (local[:, -1], products[:, -1]))[1]
-    return (local + moved(products, starts[:, None])).reshape(-1, n, n)[:N]
+    kernel = _recurrence_kernel if len(noise) < LONG else _recurrence_in_pieces
+    return _or_kernel(_scan, kernel, closed, noise, jnp.zeros_like(noise[0]))
 
 
-def _or_kernel(scan: Callable, kernel: Callable, *args: Array, lanes: Any = None) -> Any:
+def _or_kernel(scan: Callable, kernel: Callable, *args: Any, lanes: Any = None) -> Any:
     """The kernel where it runs, or on CPUs `lanes`, the scan of a batch in the last axis; both with
     the derivative of the scan."""
-    longest = max(size for v in args for size in v.shape[-1:])
+    longest = max(size for v in jax.tree.leaves(args) for size in v.shape[-1:])
     if longest > MOST:
         return scan(*args)
     if not on_gpu():
@@ -111,11 +104,14 @@ def _or_kernel(scan: Callable, kernel: Callable, *args: Array, lanes: Any = None
     return with_derivative_of(scan, kernel)(*args)
 
 
-def _scan(M: Array, w: Array, start: Array, *, adjoint: bool, unroll: int = 1) -> Array:
+def _scan(M: Array, w: Array, start: Array, *, adjoint: bool = False, unroll: int = 1) -> Array:
+    """The recurrence of vectors; or of matrices w (N, n, n), y_k = M_k y_{k−1} M_k' + w_k."""
+
     def stage(y: Array, at: tuple) -> tuple[Array, Array]:
         own, w = at
         own = M if own is None else own
-        y = matmul(y, own if adjoint else own.T) + w
+        moved = matmul(y, own if adjoint else own.T)
+        y = (moved if y.ndim == 1 else matmul(own, moved)) + w
         return y, y
 
     xs = (None if M.ndim == 2 else M, w)
@@ -123,15 +119,9 @@ def _scan(M: Array, w: Array, start: Array, *, adjoint: bool, unroll: int = 1) -
 
 
 def _tracking_by(
-    recurrence: Callable,
-    closed: Array,
-    K: Array,
-    inverse: Array,
-    A: Array,
-    B: Array,
-    gx: Array,
-    gu: Array,
+    recurrence: Callable, gains: Gains, A: Array, B: Array, gx: Array, gu: Array
 ) -> tuple[Array, Array]:
+    closed, K, inverse, _ = gains
     apply = lambda M, v: jnp.einsum("...ij,...j->...i", M, v, precision="highest")
     turned = lambda M, v: apply(jnp.swapaxes(M, -1, -2), v)
     h = gx[:-1] + turned(K, gu)
@@ -189,66 +179,114 @@ def _riccati_lanes(Q: Array, R: Array, A: Array, B: Array) -> Gains:
     return jax.lax.scan(stage, Q[-1], (Q[:-1], R, *own), reverse=True)[1]
 
 
-def _recurrence_kernel(M: Array, w: Array, start: Array, *, adjoint: bool) -> Array:
-    N, n = w.shape
+def _recurrence_in_pieces(
+    M: Array, w: Array, start: Array, products: Array | None = None, *, adjoint: bool = False
+) -> Array:
+    """The recurrence by pieces that run side by side. products: those of `_products`."""
+    if products is None:
+        products = _products(M, len(w))
+    pieces = partial(_recurrence_kernel, adjoint=adjoint, pieces=len(products))
+    return pieces(M, w, start, (products, pieces(M, w, jnp.zeros_like(start), ends=True)))
 
-    def recurrence_stages(M_ref: Any, w_ref: Any, start_ref: Any, out_ref: Any) -> None:
-        i = indices(padded_side(n))
+
+def _recurrence_kernel(
+    M: Array,
+    w: Array,
+    start: Array,
+    before: tuple[Array, Array] | tuple[()] = (),
+    *,
+    adjoint: bool = False,
+    pieces: int = 1,
+    ends: bool = False,
+) -> Array:
+    """The recurrence, a program a piece. before: the products and ends of the pieces, with which
+    each finds its start. ends: return those of all pieces from the same start."""
+    (N, *own), n = w.shape, w.shape[-1]
+
+    def recurrence_stages(*refs: Any) -> None:
+        M_ref, w_ref, start_ref, *before_refs, out_ref = refs
+        i = indices(_side(n))
+        entry: tuple = (i,)
         here = i < n
+        if len(own) == 2:
+            entry, here = (i[:, None], i[None, :]), here[:, None] & here[None, :]
         shared = _matrix(M_ref, None, n, n) if M.ndim == 2 else None
 
+        def moved(M: Array, y: Array) -> Array:
+            if y.ndim == 1:
+                return jnp.sum(
+                    M * (y[:, None] if adjoint else y[None, :]), axis=0 if adjoint else 1
+                )
+            return dot(M, dot(y, M.T, EXACT), EXACT)
+
+        def of_piece(step: Array, y: Array) -> Array:
+            products_ref, ends_ref = before_refs
+            k = pieces - 1 - step if adjoint else step
+            end = load(ends_ref.at[(k, *entry)], here)
+            return moved(_matrix(products_ref, k, n, n), y) + end
+
         def stage(step: Array, y: Array) -> Array:
-            k = N - 1 - step if adjoint else step
-            own = _matrix(M_ref, k, n, n) if shared is None else shared
-            product = own * (y[:, None] if adjoint else y[None, :])
-            y = jnp.sum(product, axis=0 if adjoint else 1) + load(w_ref.at[k, i], here)
-            store(out_ref.at[k, i], y, here)
+            k = first + (stages - 1 - step if adjoint else step)
+            matrix = _matrix(M_ref, k, n, n) if shared is None else shared
+            y = moved(matrix, y) + load(w_ref.at[(k, *entry)], here)
+            if not ends:
+                store(out_ref.at[(k, *entry)], y, here)
             return y
 
-        jax.lax.fori_loop(jnp.int32(0), jnp.int32(N), stage, load(start_ref.at[i], here))
+        zero, place = jnp.int32(0), program()
+        first, stages = _stages_of(place, pieces, N)
+        y = load(start_ref.at[entry], here)
+        if before:
+            y = jax.lax.fori_loop(zero, pieces - 1 - place if adjoint else place, of_piece, y)
+        y = jax.lax.fori_loop(zero, stages, stage, y)
+        if ends:
+            store(out_ref.at[(place, *entry)], y, here)
 
-    return call(recurrence_stages, jax.ShapeDtypeStruct((N, n), w.dtype))(M, w, start)
-
-
-def _in_pieces(M: Array, w: Array, start: Array, *, adjoint: bool) -> Array:
-    """The recurrence by pieces that run side by side."""
-    N, n = w.shape
-    own = None if M.ndim == 2 else 0
-    # What is added stands where the recurrence ends, after all its stages.
-    M, w = (M if own is None else _pieces(M, at_front=adjoint)), _pieces(w, at_front=adjoint)
-    length = w.shape[1]
-    run = partial(_recurrence_kernel, adjoint=adjoint)
-    local = jax.vmap(run, in_axes=(own, 0, None))(M, w, jnp.zeros_like(start))
-    columns = jax.vmap(run, in_axes=(None, None, 0), out_axes=2)
-    product = lambda M: columns(M, jnp.zeros_like(w[0]), jnp.eye(n, dtype=w.dtype))
-    products = product(M) if own is None else jax.vmap(product)(M)
-    products = jnp.broadcast_to(products, (len(w), length, n, n))
-    last = 0 if adjoint else -1
-    turned = jnp.swapaxes(products[:, last], 1, 2) if adjoint else products[:, last]
-    ends = run(turned, local[:, last], start)
-    starts = [ends[1:], start[None]] if adjoint else [start[None], ends[:-1]]
-    moved = jnp.einsum("pkij,pj->pki", products, jnp.concatenate(starts), precision="highest")
-    y = (local + moved).reshape(-1, n)
-    return y[-N:] if adjoint else y[:N]
+    out = jax.ShapeDtypeStruct((pieces if ends else N, *own), w.dtype)
+    return call(recurrence_stages, out, grid=pieces)(M, w, start, *before)
 
 
-def _pieces(v: Array, *, at_front: bool = False) -> Array:
-    """Return v (N, …) in pieces of √N stages, filled up with zeros at the end or the front."""
-    length = math.isqrt(len(v) - 1) + 1
-    missing = -len(v) % length
-    stages = (missing, 0) if at_front else (0, missing)
-    return jnp.pad(v, [stages, *[(0, 0)] * (v.ndim - 1)]).reshape(-1, length, *v.shape[1:])
+def _products(M: Array, N: int) -> Array:
+    """The product of the matrices M (N, n, n), or (n, n), of each of √N pieces, the last first."""
+    n, pieces = M.shape[-1], _count(N)
+
+    def products_of_pieces(M_ref: Any, out_ref: Any) -> None:
+        i = indices(_side(n))
+        row, column = i[:, None], i[None, :]
+        shared = _matrix(M_ref, None, n, n) if M.ndim == 2 else None
+        first, stages = _stages_of(program(), pieces, N)
+
+        def stage(step: Array, product: Array) -> Array:
+            own = _matrix(M_ref, first + step, n, n) if shared is None else shared
+            return dot(own, product, EXACT)
+
+        start = jnp.where((row == column) & (row < n), 1.0, 0.0).astype(M.dtype)
+        product = jax.lax.fori_loop(jnp.int32(0), stages, stage, start)
+        store(out_ref.at[program(), row, column], product, (row < n) & (column < n))
+
+    out = jax.ShapeDtypeStruct((pieces, n, n), M.dtype)
+    return call(products_of_pieces, out, grid=pieces)(M)
 
 
-def _tracking_kernel(
-    closed: Array, K: Array, inverse: Array, A: Array, B: Array, gx: Array, gu: Array
-) -> tuple[Array, Array]:
+def _count(N: int) -> int:
+    """How many pieces N stages have."""
+    return -(-N // (math.isqrt(N - 1) + 1))
+
+
+def _stages_of(piece: Array, pieces: int, N: int) -> tuple[Array, Array]:
+    """The first stage of a piece, and how many it has: the last one may have less."""
+    length = -(-N // pieces)
+    first = piece * length
+    return first, jnp.minimum(N - first, length)
+
+
+def _tracking_kernel(gains: Gains, A: Array, B: Array, gx: Array, gu: Array) -> tuple[Array, Array]:
     # K and G⁻¹ are half of what `closed` is to read, and reading is what takes the time.
     (N, m), n = gu.shape, gx.shape[-1]
 
     def tracking_stages(*refs: Any) -> None:
         K_ref, inverse_ref, A_ref, B_ref, gx_ref, gu_ref, x_ref, u_ref = refs
-        side = padded_side(max(n, m))
+        side = _side(max(n, m))
         i = indices(side)
         state, moved = i < n, i < m
         matrix = lambda ref, k, rows, columns: _matrix(ref, k, rows, columns, side)
@@ -282,60 +320,170 @@ def _tracking_kernel(
         store(x_ref.at[N, i], x, state)
 
     out = [jax.ShapeDtypeStruct(v.shape, v.dtype) for v in (gx, gu)]
-    x, u = call(tracking_stages, out)(K, inverse, A, B, gx, gu)
+    x, u = call(tracking_stages, out)(gains.K, gains.inverse, A, B, gx, gu)
     return x, u
 
 
-def _riccati_kernel(Q: Array, R: Array, A: Array, B: Array) -> Gains:
+def _riccati_kernel(Q: Array, R: Array, A: Array, B: Array, ends: Array | None = None) -> Gains:
+    """The recursion, a program a piece. ends (pieces, n, n): S at the end of each, None: of one
+    piece that ends with Q_N."""
     N, n, m, dtype = len(R), Q.shape[-1], R.shape[-1], Q.dtype
-    side = padded_side(max(n, m))
-    times = partial(dot, product=EXACT)
+    pieces = 1 if ends is None else len(ends)
 
     def riccati_stages(*refs: Any) -> None:
-        Q_ref, R_ref, A_ref, B_ref, closed_ref, K_ref, inverse_ref = refs
-        i = indices(side)
+        *given, closed_ref, K_ref, inverse_ref = refs
+        stage_at = _riccati_stages(given[:4], (Q, R, A, B))
+        i = indices(_side(max(n, m)))
         row, column = i[:, None], i[None, :]
-        matrix = lambda ref, k, rows, columns: _matrix(ref, k, rows, columns, side)
+        first, stages = _stages_of(program(), pieces, N)
 
         def stage(step: Array, S: Array) -> Array:
-            k = N - 1 - step
-            at = lambda ref, given: k if given.ndim == 3 else None
-            A_k, B_k = matrix(A_ref, at(A_ref, A), n, n), matrix(B_ref, at(B_ref, B), n, m)
-            R_k = matrix(R_ref, k, m, m)
-            BtS = times(B_k.T, S)
-            # Gauss-Jordan in place: R + B'SB is definite, no pivoting.
-            G = R_k + times(BtS, B_k)
-            for j in range(m):
-                along = jnp.sum(jnp.where(row == j, G, 0.0), axis=0)
-                down = jnp.sum(jnp.where(column == j, G, 0.0), axis=1)
-                pivot = 1 / jnp.sum(jnp.where(i == j, along, 0.0))
-                pivot_row = jnp.where(column == j, pivot, along[None, :] * pivot)
-                less = G - down[:, None] * (along * pivot)[None, :]
-                others = jnp.where(column == j, -down[:, None] * pivot, less)
-                G = jnp.where(row == j, pivot_row, others)
-            K = -times(G, times(BtS, A_k))
-            closed = A_k + times(B_k, K)
+            k = first + stages - 1 - step
+            S, (closed, K, G, _), _ = stage_at(k, S)
             found = (closed_ref, closed, n, n), (K_ref, K, m, n), (inverse_ref, G, m, m)
             for ref, v, rows, columns in found:
                 inside = (row < rows) & (column < columns)
                 store(ref.at[k, row, column], v, inside)
-            S = (
-                matrix(Q_ref, k, n, n)
-                + times(closed.T, times(S, closed))
-                + times(K.T, times(R_k, K))
-            )
-            return (S + S.T) / 2
+            return S
 
-        jax.lax.fori_loop(jnp.int32(0), jnp.int32(N), stage, matrix(Q_ref, N, n, n))
+        end, k = (given[0], N) if ends is None else (given[4], program())
+        jax.lax.fori_loop(jnp.int32(0), stages, stage, _matrix(end, k, n, n, len(i)))
 
     shapes = [(N, n, n), (N, m, n), (N, m, m)]
     out = [jax.ShapeDtypeStruct(shape, dtype) for shape in shapes]
-    return Gains(*call(riccati_stages, out)(Q, R, A, B))
+    given = (Q, R, A, B) if ends is None else (Q, R, A, B, ends)
+    return Gains(*call(riccati_stages, out, grid=pieces)(*given))
+
+
+def _riccati_in_pieces(Q: Array, R: Array, A: Array, B: Array) -> Gains:
+    """The recursion by pieces that run side by side.
+
+    A piece whose end costs ½ x'E x has, as functions of the multiplier λ of its end, the gains of
+    this cost and u = Kx − G⁻¹B'Φ⁺'λ, hence x_end = Φx − Dλ. An end that costs S ⪰ E has
+    λ = (S − E) x_end, and so, with S − E = LL',
+
+        S_start = J + Φ'L (I + L'DL)⁻¹ L'Φ.
+
+    E is what the state at the end costs by itself: S ⪰ E, and all sums are of semidefinite terms.
+    (Särkkä & García-Fernández 2023, IEEE TAC 68(3), have E = 0, and R⁻¹ in place of G⁻¹.)
+    """
+    return _riccati_kernel(Q, R, A, B, _riccati_ends(Q, *_riccati_pieces(Q, R, A, B)))
+
+
+def _riccati_pieces(Q: Array, R: Array, A: Array, B: Array) -> tuple[Array, Array, Array]:
+    """J, Φ and D (pieces, n, n) of each of √N pieces."""
+    N, n, m = len(R), Q.shape[-1], R.shape[-1]
+    pieces = _count(N)
+
+    def riccati_pieces(*refs: Any) -> None:
+        *given, J_ref, move_ref, spread_ref = refs
+        stage_at = _riccati_stages(given, (Q, R, A, B))
+        i = indices(_side(max(n, m)))
+        row, column = i[:, None], i[None, :]
+        times = partial(dot, product=EXACT)
+        first, stages = _stages_of(program(), pieces, N)
+
+        def stage(step: Array, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+            S, move, spread = carry
+            S, (closed, _, G, _), B_k = stage_at(first + stages - 1 - step, S)
+            moved = times(move, B_k)
+            return S, times(move, closed), spread + times(moved, times(G, moved.T))
+
+        identity = jnp.where((row == column) & (row < n), 1.0, 0.0).astype(Q.dtype)
+        end = _matrix(given[0], first + stages, n, n, len(i))
+        start = end, identity, jnp.zeros_like(identity)
+        found = jax.lax.fori_loop(jnp.int32(0), stages, stage, start)
+        for ref, v in zip((J_ref, move_ref, spread_ref), found, strict=True):
+            store(ref.at[program(), row, column], v, (row < n) & (column < n))
+
+    out = [jax.ShapeDtypeStruct((pieces, n, n), Q.dtype)] * 3
+    return call(riccati_pieces, out, grid=pieces)(Q, R, A, B)
+
+
+def _riccati_ends(Q: Array, J: Array, move: Array, spread: Array) -> Array:
+    """S (pieces, n, n) at the end of each piece, from that of the last on."""
+    pieces, n, _ = J.shape
+    N = len(Q) - 1
+    # Above the rounding of S in its own units, so that S − E has a Cholesky factor.
+    rounding = 8 * n * float(jnp.finfo(J.dtype).eps)
+
+    def riccati_ends(*refs: Any) -> None:
+        Q_ref, J_ref, move_ref, spread_ref, out_ref = refs
+        i = indices(_side(n))
+        row, column = i[:, None], i[None, :]
+        diagonal = row == column
+        times = partial(dot, product=EXACT)
+
+        def piece(step: Array, S: Array) -> Array:
+            k = pieces - 1 - step
+            store(out_ref.at[k, row, column], S, (row < n) & (column < n))
+            J, move, spread = (_matrix(ref, k, n, n) for ref in (J_ref, move_ref, spread_ref))
+            first, stages = _stages_of(k, pieces, N)
+            own = _matrix(Q_ref, first + stages, n, n)
+            left, L = S - own + jnp.where(diagonal, rounding * S, 0.0), jnp.zeros_like(S)
+            for j in range(n):
+                along = jnp.sum(jnp.where(column == j, left, 0.0), axis=1)
+                pivot = jnp.sum(jnp.where(i == j, along, 0.0))
+                along = along / jnp.sqrt(jnp.where(pivot > 0, pivot, jnp.inf))
+                along = jnp.where(i >= j, along, 0.0)
+                L = jnp.where(column == j, along[:, None], L)
+                left = left - along[:, None] * along[None, :]
+            W = jnp.where(diagonal, 1.0, 0.0) + times(L.T, times(spread, L))
+            reached = times(L.T, move)
+            S = J + times(reached.T, times(_inverse(W, n), reached))
+            return (S + S.T) / 2
+
+        jax.lax.fori_loop(jnp.int32(0), jnp.int32(pieces), piece, _matrix(Q_ref, N, n, n))
+
+    out = jax.ShapeDtypeStruct(J.shape, J.dtype)
+    return call(riccati_ends, out)(Q, J, move, spread)
+
+
+def _riccati_stages(refs: Any, arrays: tuple[Array, ...]) -> Callable:
+    """Return the function of a stage k and S⁺ that gives S, the gains, and B."""
+    n, m = arrays[0].shape[-1], arrays[1].shape[-1]
+    side = _side(max(n, m))
+    times = partial(dot, product=EXACT)
+    sides = (n, n), (m, m), (n, n), (n, m)
+
+    def stage(k: Array, S: Array) -> tuple[Array, Gains, Array]:
+        Q, R, A, B = (
+            _matrix(ref, k if v.ndim == 3 else None, *shape, side)
+            for ref, v, shape in zip(refs, arrays, sides, strict=True)
+        )
+        BtS = times(B.T, S)
+        G = _inverse(R + times(BtS, B), m)
+        K = -times(G, times(BtS, A))
+        closed = A + times(B, K)
+        S = Q + times(closed.T, times(S, closed)) + times(K.T, times(R, K))
+        return (S + S.T) / 2, Gains(closed, K, G), B
+
+    return stage
+
+
+def _inverse(G: Array, m: int) -> Array:
+    """The inverse of a definite matrix of m rows in a kernel, by Gauss-Jordan without pivoting."""
+    i = indices(len(G))
+    row, column = i[:, None], i[None, :]
+    for j in range(m):
+        along = jnp.sum(jnp.where(row == j, G, 0.0), axis=0)
+        down = jnp.sum(jnp.where(column == j, G, 0.0), axis=1)
+        pivot = 1 / jnp.sum(jnp.where(i == j, along, 0.0))
+        pivot_row = jnp.where(column == j, pivot, along[None, :] * pivot)
+        less = G - down[:, None] * (along * pivot)[None, :]
+        others = jnp.where(column == j, -down[:, None] * pivot, less)
+        G = jnp.where(row == j, pivot_row, others)
+    return G
+
+
+def _side(n: int) -> int:
+    """The side of matrices of n rows in a kernel."""
+    return padded_side(n, least=8)
 
 
 def _matrix(ref: Any, k: Any, rows: int, columns: int, side: int | None = None) -> Array:
     """The matrix (rows, columns) at stage k (None: the only one), filled up with zeros."""
-    side = padded_side(max(rows, columns)) if side is None else side
+    side = _side(max(rows, columns)) if side is None else side
     i = indices(side)
     row, column = i[:, None], i[None, :]
     place = ref.at[row, column] if k is None else ref.at[k, row, column]

@@ -68,6 +68,8 @@ from jaxmpc.sets.convex_sets import Ellipsoid
 # Most stages that the passes of an ADMM step write out, without a loop over them. Loops reorder
 # (batch, N, …) to (N, batch, …) at each step, which takes longer than the products.
 UNROLL = 32
+# ADMM steps, where ADMM.iterations is None and Newton steps follow.
+ADMM_STEPS = 20
 # Newton steps before the interior point method, where ADMM.newton_steps is None.
 NEWTON_STEPS = 6
 
@@ -123,7 +125,7 @@ def factor_stages(mpc: MPC, solver: ADMM = DEFAULT, scale: Reals | None = None) 
     shape = (rows,) if scale is None else np.shape(as_array(scale))
     if shape != (rows,):
         fail("scale", f"shape {shape}", f"Give ({rows},), one number a row")
-    return _factor(*arrays((mpc, solver.rho, scale)), steps=solver.admm_steps() > 0)
+    return _factor(*arrays((mpc, solver.rho, scale)), steps=solver.admm_steps(ADMM_STEPS) > 0)
 
 
 def checked(mpc: MPC, solver: ADMM) -> MPC:
@@ -275,7 +277,7 @@ def _plan(
     mpc = jax.tree.map(lambda v: jnp.where(usable, v, 0), mpc)
     s = factor.stages.aimed(aim)
     found = stage_solution(factor, s, solver, warm_start)
-    found = replace(found, iterations=jnp.int32(solver.admm_steps()))
+    found = replace(found, iterations=jnp.int32(solver.admm_steps(ADMM_STEPS)))
     x = s.of_system(predict(s, found.z))
     return answer(mpc, s.layout, found, fault, x, found.z, aim)
 
@@ -318,7 +320,7 @@ def searched(
         bounds, v = s.bounds.scaled(E), E * rows
         t = v if warm_start is None else start(bounds, rho[0], v, scaled_multipliers(E, y))
         schedule, free = stage_splittings(factor, s, min(s.horizon, UNROLL))
-        t, _ = iterate(schedule, bounds, t, solver.admm_steps(), solver.alpha)
+        t, _ = iterate(schedule, bounds, t, solver.admm_steps(ADMM_STEPS), solver.alpha)
         u, y = read(factor, s, bounds, t, free)
     y = jnp.where(E == 0, fixed, y)
     newton = solver.most_newton_steps(NEWTON_STEPS)
