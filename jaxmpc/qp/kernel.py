@@ -160,7 +160,7 @@ def program() -> Array:
 def dot(a: Array, b: Array, product: Product) -> Array:
     """Return the product of two matrices; product: EXACT or ROUGH, for float32 on tensor cores."""
     if min(*a.shape, *b.shape) < LEAST:
-        return jnp.sum(a[:, :, None] * b[None, :, :], axis=1)
+        return jnp.sum(a.T[:, :, None] * b[:, None, :], axis=0)
     return lax.dot_general(
         a, b, (((1,), (0,)), ((), ())), precision=product, preferred_element_type=a.dtype
     )
