@@ -1,4 +1,5 @@
-"""What the kernels bring on a GPU: ADMM's speed, plans of very many states, TurboMPC's protocol.
+"""What the kernels bring on a GPU: ADMM's speed, plans of very many states, of long horizons,
+TurboMPC's protocol.
 
     python experiments/kernels.py [--small]
 
@@ -26,6 +27,7 @@ from jaxmpc.qp.jax_transformations import on_gpu
 from jaxmpc.qp.kernel import ROUGH
 
 PLANS = [("joint", 2**20), ("springs4", 2**20), ("springs8", 2**16)]
+HORIZONS = (1_000, 8_000)
 LOOPS, TOLERANCES, STEPS = (64, 1024, 65_536), (1e-3, 1e-5, 1e-7), 50
 REPEATS = 4
 
@@ -73,6 +75,28 @@ def plan_task(name: str, count: int) -> Task:
     return Task(f"plans {name} {count}", plans, (jnp.asarray(x),), count, say)
 
 
+def long_task(horizon: int, count: int) -> Task:
+    """Plans stage by stage of a random system of 8 states and 4 inputs with limits on all."""
+    rng = np.random.default_rng(0)
+    A, B = rng.standard_normal((8, 8)), rng.standard_normal((8, 4))
+    A *= 0.95 / np.abs(np.linalg.eigvals(A)).max()
+    states, inputs = (
+        jm.Box(-limit * np.ones(n), limit * np.ones(n)) for n, limit in ((8, 3), (4, 0.5))
+    )
+    mpc = jm.MPC(
+        jm.LinearSystem(A, B), np.eye(8), 0.1 * np.eye(4), horizon, states=states, inputs=inputs,
+        terminal_cost=np.eye(8),
+    )  # fmt: skip
+    x = jnp.asarray(rng.uniform(-1, 1, (count, 8)))
+
+    def say(plans: Any, _: float) -> str:
+        limits = jnp.max(jnp.abs(plans.inputs))
+        return f"{np.mean(plans.status == jm.Status.SOLVED):.4%} solved, inputs up to {limits:.9f}"
+
+    plans = jax.jit(jax.vmap(lambda x: jm.mpc.solve_stagewise(mpc, x)))
+    return Task(f"plans of {horizon} stages {count}", plans, (x,), count, say)
+
+
 def loop_tasks(count: int, gradient: bool) -> list[Task]:
     """TurboMPC's protocol: closed loops of 50 samples from `count` states; with the gradient of
     their cost with respect to the diagonals of Q and R."""
@@ -101,6 +125,7 @@ def run_all(small: bool) -> None:
     size = lambda count: min(count, 64) if small else count
     tasks = [admm_task(name, size(count // 4)) for name, count in PLANS] if on_gpu() else []
     tasks += [plan_task(name, size(count)) for name, count in PLANS]
+    tasks += [long_task(40 if small else horizon, 64) for horizon in HORIZONS]
     tasks += [t for grad in (False, True) for count in LOOPS for t in loop_tasks(size(count), grad)]
     compiled: dict[Any, Any] = {}
     with ThreadPoolExecutor() as pool:
