@@ -238,13 +238,13 @@ class Control(NamedTuple, Generic[Planned]):
     """What a controller gives at one time step, from which it goes on at the next.
 
     u (m,): the input to apply, within its limits. plan: the plan whose first input it is, NaN where
-    the state was not finite. memory: the last finite plan, of which the next is warm-started; None
-    for a controller without plans.
+    the state was not finite. memory: what the controller goes on from at the next time step, the
+    last finite plan in most, of which the next is warm-started; None for one without plans.
     """
 
     u: Array
     plan: Planned
-    memory: WarmStart | None
+    memory: Any
 
 
 def anchored(start: WarmStart, x0: Array) -> WarmStart:

@@ -17,10 +17,13 @@ sideways too hard: |λ_1| + |λ_2| ≤ μ λ_n, the pyramid that MuJoCo's own co
 are rows in ξ and u of `robot_mpc` (`friction_cones`), not of the model, in which feet never slip.
 
 The plant keeps its real contacts: springs that sink in, slide, and let go.
+
+Feet that stand in turn (`gaits.py`) are one model too: those that swing have no rows, and no force.
 """
 
 import copy
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import jax
@@ -43,6 +46,8 @@ _NEAR, _TOUCHING = 0.05, 0.005
 _FRICTION = 0.8
 # Smallest motion of a foot, relative to the largest, that counts as one.
 _RANK = 1e-6
+# Beside fields of mjx.Model: 1 for each foot (k,) that stands, 0 for one that swings.
+STANDING = "feet_standing"
 
 
 @record
@@ -166,7 +171,8 @@ def _rate(model: "mujoco.MjModel", contact: Any) -> float:
 
 
 class StandingPhysics(Physics):
-    """A model without contacts whose feet stand; see the top of this file."""
+    """A model without contacts whose feet stand, all or those that the number `STANDING` says; see
+    the top of this file."""
 
     def __init__(self, model: "mujoco.MjModel", feet: Feet) -> None:
         super().__init__(model)
@@ -175,11 +181,15 @@ class StandingPhysics(Physics):
     def _rates(self, numbers: dict[str, Array], q: Array, v: Array, act: Array, u: Array) -> Array:
         return self._standing(numbers, q, v, act, u)[0]
 
-    def contact_forces(self, x: Array, u: Array) -> Array:
+    def _forced(self, numbers: dict[str, Array], *point: Array) -> tuple[Any, Any]:
+        of_model = {key: value for key, value in numbers.items() if key != STANDING}
+        return super()._forced(of_model, *point)
+
+    def contact_forces(self, x: Array, u: Array, numbers: dict[str, Array]) -> Array:
         """Return the contact forces λ (3k,), normal and two tangential ones of each foot (N), at
         x = (qpos, qvel, act) under u."""
         q, v, act = jnp.split(x, [self.model.nq, self.model.nq + self.model.nv])
-        return self._standing({}, normalised(self.joints, q), v, act, u)[1]
+        return self._standing(numbers, normalised(self.joints, q), v, act, u)[1]
 
     def _standing(
         self, numbers: dict[str, Array], q: Array, v: Array, act: Array, u: Array
@@ -193,11 +203,13 @@ class StandingPhysics(Physics):
         )
         zero, one = jnp.zeros((), q.dtype), jnp.ones((), q.dtype)
         speeds, drift = jax.jvp(velocities, (zero,), (one,))
-        J = self._feet_jacobian(numbers, q)
+        standing = numbers.get(STANDING, np.ones(len(self.feet)))
+        rows = jnp.repeat(jnp.asarray(standing, q.dtype), 3)
+        J = rows[:, None] * self._feet_jacobian(numbers, q)
         by_forces = solve(M, J.T)
         rate = np.repeat(self.feet.rate, 3).astype(q.dtype)
-        lacking = matmul(J, free) + drift + rate * speeds
-        forces = -solve(matmul(J, by_forces), lacking)
+        lacking = matmul(J, free) + rows * (drift + rate * speeds)
+        forces = -solve(matmul(J, by_forces) + jnp.diag(1 - rows), lacking)
         return free + matmul(by_forces, forces), forces
 
     def _feet_jacobian(self, numbers: dict[str, Array], q: Array) -> Array:
@@ -256,24 +268,26 @@ def friction_cones(robot: RobotDescription, x: Any, u: Any) -> ForceLimits | Non
     physics = robot.predictor
     if not isinstance(physics, StandingPhysics):
         return None
-    feet = physics.feet
     with jax.enable_x64(True):
         xi, u = robot.coordinates(jnp.asarray(x, float)), jnp.asarray(u, float)
+        C, D, upper = map(np.asarray, jax.jit(partial(linear_cones, robot, {}))(xi, u))
+    labels = tuple(f"friction cone of {name}" for name in physics.feet.names for _ in range(4))
+    units = ("N",) * len(labels)
+    return ForceLimits(C, upper=upper, D=D, stages=None, names=labels, units=units)
 
-        def forces(xi: Array, u: Array) -> tuple[Array, Array]:
-            found = physics.contact_forces(robot.state(xi), u)
-            return found, found
 
-        slopes, there = jax.jit(jax.jacfwd(forces, argnums=(0, 1), has_aux=True))(xi, u)
-        by_state, by_input = (np.asarray(slope) for slope in slopes)
-    faces = feet.cones()
-    shift = np.asarray(there) - by_state @ np.asarray(xi) - by_input @ np.asarray(u)
-    labels = tuple(f"friction cone of {name}" for name in feet.names for _ in range(4))
-    return ForceLimits(
-        faces @ by_state,
-        upper=-faces @ shift,
-        D=faces @ by_input,
-        stages=None,
-        names=labels,
-        units=("N",) * len(labels),
-    )
+def linear_cones(
+    robot: RobotDescription, numbers: dict[str, Array], xi: Array, u: Array
+) -> tuple[Array, Array, Array]:
+    """Return C (4k, n), D (4k, m) and the upper sides (4k,) of the friction cones, linearised at ξ
+    and u. numbers: as in `Robot.linearize`, with `STANDING`."""
+    physics: Any = robot.predictor
+
+    def forces(xi: Array, u: Array) -> tuple[Array, Array]:
+        found = physics.contact_forces(robot.state(xi), u, numbers)
+        return found, found
+
+    (by_state, by_input), there = jax.jacfwd(forces, argnums=(0, 1), has_aux=True)(xi, u)
+    faces = jnp.asarray(physics.feet.cones(), xi.dtype)
+    C, D = matmul(faces, by_state), matmul(faces, by_input)
+    return C, D, matmul(C, xi) + matmul(D, u) - matmul(faces, there)

@@ -1,0 +1,219 @@
+"""MPC of legged robots along a gait: linear models that change as feet stand and swing."""
+
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxmpc.arrays import Reals, as_weight, host_array
+from jaxmpc.checks import fail, require_kind, require_symmetric_psd, whole
+from jaxmpc.closed_loop.feedback import one_state
+from jaxmpc.mpc.controller import zeros_of
+from jaxmpc.mpc.plan import Control, Plan, WarmStart, applied
+from jaxmpc.mpc.problem import MPC, Soft, as_tuple, soften
+from jaxmpc.mpc.rows import layout
+from jaxmpc.mpc.stagewise.solve import solve_stagewise
+from jaxmpc.pytrees import prepared_pytree, static
+from jaxmpc.qp.admm import ADMM, DEFAULT
+from jaxmpc.qp.linalg import arrays, floating_dtype
+from jaxmpc.robots.gaits import Gait
+from jaxmpc.sets.convex_sets import Box
+
+# Periods of the gait after which its Riccati recursion counts as one that does not converge, and
+# the relative change below which it has.
+_PERIODS, _SETTLED = 200, 1e-9
+
+
+class GaitMemory(NamedTuple):
+    """What a controller remembers: the last finite plan, and how many control periods it is into
+    the motion, which the next plan begins with."""
+
+    plan: WarmStart
+    time: Array
+
+
+@prepared_pytree
+class GaitController:
+    """MPC of a legged robot along a gait, stage by stage.
+
+    At each control period the problem has the linear models of the next N, the motion of the gait
+    as reference, hard limits of inputs, and as soft rows friction cones and state limits. What
+    follows the horizon costs what it does under the periodic LQR of the gait.
+
+    gait: from `jm.robots.gait`. Q (n, n) or its diagonal (n,), R (m, m) or (m,): weights of the
+      distances from the motion and from the torques of rest.
+    horizon: control periods N.
+    solver: with iterations=None, as by default, there are no ADMM steps but Newton steps from the
+      last plan and an interior point method (`solve_stagewise`).
+    rho: L1 weight, cost per unit, of state limits; of friction cones it is 100 times as much a unit
+      of the input, as in `RobotController`.
+    margin: fraction by which state limits are tightened, as in `robot_mpc`.
+
+    `controller(x, before)` as `RobotController`. The reference is `gait.reference`, unless another
+    is given. Raises ValueError for arguments that do not fit together, and for gaits whose LQR does
+    not exist.
+    """
+
+    gait: Gait
+    mpc: MPC
+    solver: ADMM
+    rho: Any
+    cost_to_go: Any
+    horizon: int = static(default=1)
+
+    def __init__(
+        self,
+        gait: Gait,
+        Q: Reals,
+        R: Reals,
+        horizon: int = 30,
+        *,
+        solver: ADMM | None = None,
+        rho: Reals = 100.0,
+        margin: float = 0.02,
+    ) -> None:
+        require_kind("gait", gait, Gait)
+        whole("horizon", horizon, 1)
+        if not 0 <= margin < 1:
+            fail("margin", f"{margin}", "Give a fraction in [0, 1)")
+        robot = gait.robot
+        Q, R = (host_array("Q", as_weight(Q, robot.n)), host_array("R", as_weight(R, robot.m)))
+        require_symmetric_psd("Q", Q)
+        require_symmetric_psd("R", R, definite=True)
+        P = periodic_cost_to_go(gait, Q, R)
+        first = {name: v[0] for name, v in _matrices(gait).items()}
+        limits = MPC(
+            system=replace(gait.system, **first), Q=Q, R=R, horizon=horizon,
+            states=robot.state_limits.tightened(margin), inputs=robot.input_limits,
+            constrained_stages=tuple(range(1, horizon + 1)), terminal_cost=P[0], prestabilise=False,
+        )  # fmt: skip
+        solver = DEFAULT if solver is None else solver
+        solver = replace(solver, iterations=0) if solver.iterations is None else solver
+        vars(self).update(gait=arrays(gait), mpc=arrays(soften(limits, rho)), rho=rho)
+        vars(self).update(solver=arrays(solver), cost_to_go=jnp.asarray(P), horizon=horizon)
+        self.problem(jnp.int32(0)).validate()
+
+    def __repr__(self) -> str:
+        """Return in one line what it controls."""
+        feet = ", ".join(self.gait.names)
+        return f"GaitController({self.gait.robot.name} on {feet}, horizon {self.horizon})"
+
+    @property
+    def robot(self) -> Any:
+        """The robot, with the model of its feet."""
+        return self.gait.robot
+
+    @property
+    def dtype(self) -> Any:
+        """Return the precision of the plans."""
+        return floating_dtype((self.mpc.Q, self.mpc.R))
+
+    @property
+    def state_size(self) -> int:
+        """Return the length of the robot's state, nq + nv."""
+        return self.robot.state_size
+
+    @property
+    def limits(self) -> Box:
+        """Return the robot's own state limits, without margin."""
+        return self.robot.state_limits
+
+    def coordinates(self, x: Array) -> Array:
+        """Return the coordinates ξ (n,) of the robot's state."""
+        return self.robot.coordinates(x)
+
+    def problem(self, time: Array) -> MPC:
+        """Return the problem of the horizon that begins at a control period of the motion."""
+        gait, N = self.gait, self.horizon
+        phases = (time + jnp.arange(N)) % gait.period
+        system, cones = (
+            jax.tree.map(lambda v: v[phases], part) for part in (_matrices(gait), gait.cones)
+        )
+        size = jnp.max(jnp.abs(gait.cones.D), axis=(0, 2))
+        weight = 100 * jnp.max(jnp.asarray(self.rho)) / jnp.where(size > 0, size, 1.0)
+        friction = Soft(
+            cones.C, None, cones.upper, weight, 0.0, cones.D, tuple(range(N)), _labels(gait)
+        )
+        last = self.cost_to_go[(time + N) % gait.period]
+        return replace(
+            self.mpc,
+            system=replace(self.mpc.system, **system),
+            soft=(*as_tuple("soft", self.mpc.soft, Soft), friction),
+            terminal_cost=last,
+        )
+
+    def start(self, x: Array, input_reference: Any = None) -> Control[Plan]:
+        """Return what stands for the time step before the first: the torques of rest."""
+        zeros: Any = zeros_of(partial(self, input_reference=input_reference), x)
+        plan = zeros.memory.plan
+        states = jnp.broadcast_to(self.coordinates(x), plan.states.shape)
+        inputs = jnp.broadcast_to(self.gait.inputs, plan.inputs.shape)
+        warm = plan._replace(states=states, inputs=inputs)
+        return zeros._replace(u=inputs[0], memory=zeros.memory._replace(plan=warm))
+
+    def __call__(
+        self,
+        x: Reals,
+        before: Control[Plan] | None = None,
+        reference: Reals | None = None,
+        *,
+        input_reference: Reals | None = None,
+        previous_input: Reals | None = None,
+    ) -> Control[Plan]:
+        """Return the input (m,) at the state x, its plan, in ξ, and what to remember."""
+        x = one_state(self, x)
+        memory: Any = None if before is None else before.memory
+        time = jnp.int32(0) if memory is None else memory.time
+        problem = self.problem(time)
+        rows = layout(problem)
+        last = None if memory is None else memory.plan
+        if reference is None:
+            reference = self.gait.reference(self.horizon + 1, time)
+        start = None if last is None else last.shifted(rows, last.inputs[-1])
+        plan = solve_stagewise(
+            problem, self.coordinates(x), reference, self.solver, start,
+            input_reference=self.gait.inputs if input_reference is None else input_reference,
+        )  # fmt: skip
+        control = applied(problem, rows, plan, last)
+        assert control.memory is not None
+        later: Any = GaitMemory(control.memory, time + 1)
+        return control._replace(memory=later)
+
+
+def periodic_cost_to_go(gait: Gait, Q: np.ndarray, R: np.ndarray) -> np.ndarray:
+    """Return P (P, n, n): ξ'P_k ξ is the least cost of distances ξ from the motion at phase k from
+    there on, Σ ξ'Qξ + u'Ru, under the linear models of the gait.
+
+    The Riccati recursion, backward through the period until it repeats itself (Bittanti, Colaneri &
+    De Nicolao 1991, 'The periodic Riccati equation').
+    """
+    A, B = (np.asarray(v, float) for v in (gait.system.A, gait.system.B))
+    found = np.zeros((gait.period, *Q.shape))
+    P = Q
+    for _ in range(_PERIODS):
+        before = found[0].copy()
+        for k in reversed(range(gait.period)):
+            BtP = B[k].T @ P
+            K = -np.linalg.solve(R + BtP @ B[k], BtP @ A[k])
+            closed = A[k] + B[k] @ K
+            P = Q + closed.T @ P @ closed + K.T @ R @ K
+            found[k] = P = (P + P.T) / 2
+        if not np.all(np.isfinite(P)):
+            break
+        if np.abs(P - before).max() <= _SETTLED * np.abs(P).max():
+            return found
+    cure = "Weigh what it moves, or let more feet stand at a time (duty)"
+    fail("gait", "has no periodic LQR: inputs do not hold all of the motion", cure)
+
+
+def _matrices(gait: Gait) -> dict[str, Any]:
+    """Return A, B and c of the linear models."""
+    return {name: getattr(gait.system, name) for name in ("A", "B", "c")}
+
+
+def _labels(gait: Gait) -> tuple[str, ...]:
+    return tuple(f"friction cone of {name}" for name in gait.names for _ in range(4))

@@ -1,0 +1,213 @@
+"""Gaits: feet that stand in turn under a trunk of constant velocity, and linear models along that.
+
+A foot stands for the part `duty` of each period, still on the ground, and swings for the rest, from
+where it left to where it stands next. So relative to the trunk, which moves with the velocity v, it
+goes back by v T duty and forward again, in an arc. Inverse kinematics gives the joints, their
+differences the velocities, and each control period of a period of the gait has a linear model of
+its own, with the contact forces of the feet that stand (`contacts.py`), and friction cones.
+
+The motion is a reference: what a plan stays close to, not what it is bound to. Its linear models
+are exact in the inputs, since motions are affine in them.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxmpc.checks import fail, number, require_finite, require_shape
+from jaxmpc.pytrees import pytree, static
+from jaxmpc.robots.contacts import STANDING, linear_cones
+from jaxmpc.robots.description import host_coordinates
+from jaxmpc.robots.mujoco_access import FREE, mujoco, single_joints
+from jaxmpc.robots.robot import Robot
+from jaxmpc.systems.system import LinearSystem
+
+# Newton steps of inverse kinematics at most, and the distance (m) that counts as reached.
+_STEPS, _REACHED = 100, 1e-9
+
+
+class Cones(NamedTuple):
+    """Friction cones of feet, C ξ + D u ≤ upper: C (P, 4k, n), D (P, 4k, m), upper (P, 4k), ∞ in
+    the rows of feet that swing."""
+
+    C: Any
+    D: Any
+    upper: Any
+
+
+@pytree
+class Gait:
+    """A motion that repeats itself after P control periods, from `gait`.
+
+    robot: with the model of these feet. standing (P, k): whether each foot stands. states (P, n):
+    coordinates ξ; advance (n,): by which they differ a period later. inputs (m,): torques of rest.
+    system: linear models, A (P, n, n), B (P, n, m), c (P, n), from one control period to the next.
+    cones: of the feet that stand.
+    """
+
+    robot: Robot
+    standing: Any
+    states: Any
+    advance: Any
+    inputs: Any
+    system: LinearSystem
+    cones: Cones
+    names: tuple[str, ...] = static(default=())
+
+    @property
+    def period(self) -> int:
+        """Number P of control periods."""
+        return int(np.shape(self.states)[0])
+
+    def reference(self, count: int, start: Any = 0) -> Any:
+        """Return the coordinates (count, n) from the control period `start` on."""
+        steps = start + np.arange(count)
+        return self.states[steps % self.period] + (steps // self.period)[:, None] * self.advance
+
+
+def gait(
+    robot: Robot,
+    feet: Sequence[str],
+    velocity: Sequence[float] = (0.5, 0.0),
+    *,
+    period: float = 0.44,
+    duty: float = 0.57,
+    offsets: Sequence[float] | None = None,
+    lift: float = 0.06,
+    friction: float | None = None,
+) -> Gait:
+    """Return a gait of a legged robot about its home.
+
+    Arguments:
+        robot: with a free base, and legs of hinges and slides.
+        feet: names of geoms, spheres that touch flat ground at home, one a leg.
+        velocity: of the trunk along x and y, m/s.
+        period: seconds from one step of a foot to its next.
+        duty: part of the period for which a foot stands, in (0, 1).
+        offsets: when each foot begins to stand, in parts of the period. None: every other foot
+            round the trunk together, 0 and ½: the trot of four feet, the tripod of six.
+        lift: height (m) of the arcs.
+        friction: coefficient that plans count on, None for 80 % of the file's.
+
+    Raises ValueError for other robots and numbers, and where a foot cannot reach its step.
+    """
+    feet = tuple(feet)
+    standing_robot = robot.standing(feet, friction=friction)
+    model = robot.mujoco
+    if not model.njnt or model.jnt_type[0] != FREE or not np.all(single_joints(model)[1:]):
+        fail("robot", f"{robot.name} has other joints", "Give a free base, then hinges and slides")
+    require_shape("velocity", velocity, (2,), "Along x and y, in m/s")
+    require_finite("velocity", velocity)
+    for name, value in (("period", period), ("lift", lift)):
+        number(name, value, 0.0, "Give a positive number")
+    if not 0 < duty < 1:
+        fail("duty", f"{duty}", "Give a part of the period in (0, 1)")
+    count = round(period / robot.dt)
+    if count < 4:
+        fail("period", f"{period} s is {count} control periods", "Give at least 4 of them")
+    x_rest, u_rest = standing_robot.equilibrium()
+    places = _places(model, x_rest[: model.nq], feet)
+    starts = _alternating(places - x_rest[:3]) if offsets is None else np.asarray(offsets, float)
+    require_shape("offsets", starts, (len(feet),), "One for each foot")
+    require_finite("offsets", starts)
+
+    phases = (np.arange(count)[:, None] / count - starts) % 1.0
+    standing = phases < duty - 1e-9
+    steps = np.append(velocity, 0.0) * count * robot.dt * duty
+    away = steps * _along(phases, duty)[:, :, None] + [0, 0, lift] * _arc(phases, duty)[:, :, None]
+    q = _joints(model, x_rest[: model.nq], feet, places + away)
+    joints = q[:, 7:]
+    speeds = (np.roll(joints, -1, axis=0) - np.roll(joints, 1, axis=0)) / (2 * robot.dt)
+    v = np.zeros((count, model.nv))
+    v[:, :2], v[:, 6:] = velocity, speeds
+    q[:, :2] += np.arange(count)[:, None] * robot.dt * np.asarray(velocity, float)
+    rest = np.broadcast_to(x_rest[model.nq + model.nv :], (count, model.na))
+    states = host_coordinates(robot, np.hstack([q, v, rest]))
+    advance = np.zeros(robot.n)
+    advance[:2] = np.asarray(velocity, float) * count * robot.dt
+
+    def models(xi: Any, stands: Any) -> tuple[LinearSystem, tuple]:
+        numbers, u = {STANDING: stands}, jnp.asarray(u_rest)
+        system = standing_robot.linearize(robot.state(xi), u, exact=True, numbers=numbers)
+        return system, linear_cones(standing_robot, numbers, xi, u)
+
+    with jax.enable_x64(True):
+        found = jax.jit(jax.vmap(models))(jnp.asarray(states), jnp.asarray(standing, float))
+        system, (C, D, upper) = jax.tree.map(np.asarray, found)
+    faces = np.repeat(standing, 4, axis=1)
+    return Gait(
+        robot=standing_robot,
+        standing=standing,
+        states=states,
+        advance=advance,
+        inputs=u_rest,
+        system=system,
+        cones=Cones(C, D, np.where(faces, upper, np.inf)),
+        names=feet,
+    )
+
+
+def _alternating(places: np.ndarray) -> np.ndarray:
+    """Return 0 and ½ for every other foot round the trunk; places (k, 3) from its middle."""
+    order = np.argsort(np.arctan2(places[:, 1], places[:, 0]))
+    starts = np.zeros(len(places))
+    starts[order[1::2]] = 0.5
+    return starts
+
+
+def _along(phases: np.ndarray, duty: float) -> np.ndarray:
+    """Return where feet are relative to the trunk, from ½, where they begin to stand, to −½ and
+    back; in the swing as smoothly as five powers allow."""
+    swing = np.clip((phases - duty) / (1 - duty), 0.0, 1.0)
+    forward = swing**3 * (10 - 15 * swing + 6 * swing**2)
+    return np.where(phases < duty, 0.5 - phases / duty, -0.5 + forward)
+
+
+def _arc(phases: np.ndarray, duty: float) -> np.ndarray:
+    """Return the heights of feet as parts of the highest."""
+    swing = np.clip((phases - duty) / (1 - duty), 0.0, 1.0)
+    return 16 * (swing * (1 - swing)) ** 2
+
+
+def _places(model: Any, q: np.ndarray, feet: Sequence[str]) -> np.ndarray:
+    """Return the positions (k, 3) of feet."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = q
+    mujoco.mj_kinematics(model, data)
+    return np.array([data.geom(name).xpos for name in feet])
+
+
+def _joints(model: Any, home: np.ndarray, feet: Sequence[str], goals: np.ndarray) -> np.ndarray:
+    """Return configurations (P, nq) with the base at home and the feet at `goals` (P, k, 3), by
+    Gauss-Newton steps from the one before."""
+    data, J = mujoco.MjData(model), np.zeros((3, model.nv))
+    geoms = [model.geom(name).id for name in feet]
+    lower, upper = np.where(model.jnt_limited[:, None], model.jnt_range, [-np.inf, np.inf]).T
+    q, found = home.copy(), []
+    for goal in goals:
+        for _ in range(_STEPS):
+            data.qpos[:] = q
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_comPos(model, data)
+            away, rows = goal - data.geom_xpos[geoms], []
+            if np.abs(away).max() < _REACHED:
+                break
+            for geom in geoms:
+                mujoco.mj_jacGeom(model, data, J, None, geom)
+                rows.append(J[:, 6:].copy())
+            q[7:] += np.linalg.lstsq(np.vstack(rows), away.ravel(), rcond=1e-6)[0]
+        missed = np.linalg.norm(away, axis=1)
+        worst = int(np.argmax(missed))
+        problem = ""
+        if missed[worst] > _REACHED:
+            problem = f"geom {feet[worst]} stays {missed[worst]:.3g} m from its step"
+        elif np.any((q[7:] < lower[1:]) | (q[7:] > upper[1:])):
+            joint = int(np.argmax(np.maximum(lower[1:] - q[7:], q[7:] - upper[1:]))) + 1
+            problem = f"joint {model.joint(joint).name} would pass its limits"
+        if problem:
+            fail("velocity", problem, "Give a smaller velocity, lift, or a shorter period")
+        found.append(q.copy())
+    return np.array(found)
