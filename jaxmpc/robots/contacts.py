@@ -185,11 +185,11 @@ class StandingPhysics(Physics):
         of_model = {key: value for key, value in numbers.items() if key != STANDING}
         return super()._forced(of_model, *point)
 
-    def contact_forces(self, x: Array, u: Array, numbers: dict[str, Array]) -> Array:
+    def contact_forces(self, x: Array, u: Array, numbers: dict[str, Array] | None = None) -> Array:
         """Return the contact forces λ (3k,), normal and two tangential ones of each foot (N), at
-        x = (qpos, qvel, act) under u."""
+        x = (qpos, qvel, act) under u. numbers: as in `step`."""
         q, v, act = jnp.split(x, [self.model.nq, self.model.nq + self.model.nv])
-        return self._standing(numbers, normalised(self.joints, q), v, act, u)[1]
+        return self._standing(numbers or {}, normalised(self.joints, q), v, act, u)[1]
 
     def _standing(
         self, numbers: dict[str, Array], q: Array, v: Array, act: Array, u: Array

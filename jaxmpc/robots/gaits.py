@@ -102,7 +102,7 @@ def gait(
     require_shape("velocity", velocity, (2,), "Along x and y, in m/s")
     require_finite("velocity", velocity)
     for name, value in (("period", period), ("lift", lift)):
-        number(name, value, 0.0, "Give a positive number")
+        number(name, value, np.finfo(float).tiny, "Give a positive number")
     if not 0 < duty < 1:
         fail("duty", f"{duty}", "Give a part of the period in (0, 1)")
     count = round(period / robot.dt)

@@ -1,0 +1,181 @@
+"""Gaits: motions against MuJoCo's kinematics, their linear models against those of the feet that
+stand, the periodic LQR against lifted Riccati equations, and a quadruped that trots in MuJoCo."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+import scipy
+
+import jaxmpc as jm
+from jaxmpc.closed_loop import GaitController
+from jaxmpc.closed_loop.gait_controller import periodic_cost_to_go
+
+QUADRUPED = Path(__file__).parents[2] / "experiments" / "robots" / "quadruped.xml"
+FEET = ("FL", "FR", "RL", "RR")
+SPEED = 0.5
+
+
+@pytest.fixture(scope="module")
+def robot():
+    """The quadruped at 100 Hz."""
+    return jm.load_robot(QUADRUPED, control_period=0.01)
+
+
+@pytest.fixture(scope="module")
+def gait(robot):
+    """Its trot."""
+    return jm.robots.gait(robot, FEET, (SPEED, 0.0))
+
+
+def places(model, q):
+    """Where the feet are, by MuJoCo's C engine."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = q
+    mujoco.mj_kinematics(model, data)
+    return np.array([data.geom(name).xpos for name in FEET])
+
+
+def random_gait(rng, period, same=False):
+    """What the periodic LQR reads of a gait: random linear models, unstable ones."""
+    A = rng.normal(size=(period, 3, 3))
+    A *= 1.1 / np.abs(np.linalg.eigvals(A)).max()
+    B = rng.normal(size=(period, 3, 2))
+    if same:
+        A, B = (np.broadcast_to(v[0], v.shape) for v in (A, B))
+    return SimpleNamespace(period=period, system=SimpleNamespace(A=A, B=B))
+
+
+def test_periodic_lqr_of_one_model_is_the_lqr():
+    rng = np.random.default_rng(0)
+    gait, Q, R = random_gait(rng, 4, same=True), np.diag([1.0, 2.0, 0.0]), np.eye(2)
+    found = periodic_cost_to_go(gait, Q, R)
+    expected = scipy.linalg.solve_discrete_are(gait.system.A[0], gait.system.B[0], Q, R)
+    np.testing.assert_allclose(found, np.broadcast_to(expected, found.shape), rtol=1e-8)
+
+
+def test_periodic_lqr_is_that_of_the_lifted_system():
+    """Over a whole period at once: x⁺ = A x + B U with the costs of all states on the way."""
+    rng = np.random.default_rng(1)
+    gait, Q, R = random_gait(rng, 3), np.diag([1.0, 0.5, 2.0]), np.diag([0.3, 1.0])
+    for first in range(3):
+        to_x, to_u = np.eye(3), np.zeros((3, 6))
+        of_x, of_u, cross = np.zeros((3, 3)), np.kron(np.eye(3), R), np.zeros((3, 6))
+        for step in range(3):
+            A, B = (v[(first + step) % 3] for v in (gait.system.A, gait.system.B))
+            of_x, of_u = of_x + to_x.T @ Q @ to_x, of_u + to_u.T @ Q @ to_u
+            cross = cross + to_x.T @ Q @ to_u
+            to_x, to_u = A @ to_x, A @ to_u
+            to_u[:, 2 * step : 2 * step + 2] += B
+        expected = scipy.linalg.solve_discrete_are(to_x, to_u, of_x, of_u, s=cross)
+        found = periodic_cost_to_go(gait, Q, R)[first]
+        np.testing.assert_allclose(found, expected, rtol=1e-7)
+
+
+def test_gaits_without_an_lqr_are_refused():
+    gait = random_gait(np.random.default_rng(2), 3, same=True)
+    gait.system.B = 0 * gait.system.B
+    with pytest.raises(ValueError, match=r"gait: has no periodic LQR.*duty"):
+        periodic_cost_to_go(gait, np.eye(3), np.eye(2))
+
+
+@pytest.mark.parametrize(
+    ("given", "text"),
+    [
+        ({"duty": 1.0}, r"duty: 1.0.*\(0, 1\)"),
+        ({"velocity": (0.5,)}, r"velocity: shape \(1,\)"),
+        ({"velocity": (np.nan, 0.0)}, "velocity: "),
+        ({"period": 0.02}, "period: 0.02 s is 2 control periods"),
+        ({"period": -1.0}, "period: "),
+        ({"lift": 0.0}, "lift: "),
+        ({"offsets": (0.0, 0.5)}, r"offsets: shape \(2,\)"),
+        ({"velocity": (4.0, 0.0)}, r"velocity: .*(stays|limits).*smaller velocity"),
+        ({"lift": 0.5}, r"velocity: .*(stays|limits).*lift"),
+        ({"feet": ("FL", "nose")}, "feet: "),
+    ],
+)
+def test_what_is_no_gait_is_named(robot, given, text):
+    """Before anything is compiled."""
+    with pytest.raises(ValueError, match=text):
+        jm.robots.gait(**{"robot": robot, "feet": FEET, **given})
+
+
+def test_fixed_bases_have_no_gait():
+    with pytest.raises(ValueError, match="feet|robot"):
+        jm.robots.gait(jm.load_robot("arm2"), ("foot",))
+
+
+@pytest.mark.slow
+def test_feet_that_stand_stay_where_they_are(robot, gait):
+    """And the others rise, to the lift; two stand at a time, or all."""
+    model, dt, P = robot.mujoco, robot.dt, gait.period
+    with jax.enable_x64(True):
+        x = np.array([robot.state(xi) for xi in np.asarray(gait.reference(2 * P))])
+    feet = np.array([places(model, row[: model.nq]) for row in x])
+    standing = np.tile(gait.standing, (2, 1))
+    assert set(gait.standing.sum(axis=1)) == {2, 4}
+    assert np.all(gait.standing[:, [0, 1]] == gait.standing[:, [3, 2]])  # diagonal ones together
+    stay = standing[:-1] & standing[1:]
+    moved = np.abs(np.diff(feet, axis=0))[stay]
+    assert moved.max() < 1e-8
+    ground = feet[standing][:, 2].mean()
+    np.testing.assert_allclose(feet[standing][:, 2], ground, atol=1e-8)
+    np.testing.assert_allclose(feet[:, :, 2].max(axis=0) - ground, 0.06, atol=2e-3)
+    np.testing.assert_allclose(x[P:, 0] - x[:P, 0], SPEED * dt * P, rtol=1e-12)
+    # Velocities are those of the positions, to the second order of the control period.
+    for now, after in zip(x[:-1], x[1:], strict=True):
+        difference = np.zeros(model.nv)
+        mujoco.mj_differentiatePos(model, difference, dt, now[: model.nq], after[: model.nq])
+        mean = (now[model.nq :] + after[model.nq :]) / 2
+        assert np.abs(difference - mean).max() < 0.7
+
+
+@pytest.mark.slow
+def test_linear_models_are_those_of_the_feet_that_stand(robot, gait):
+    """Of two feet, by a robot that has no others."""
+    phase = int(np.flatnonzero(gait.standing.sum(axis=1) == 2)[3])
+    feet = [name for name, stands in zip(FEET, gait.standing[phase], strict=True) if stands]
+    two = robot.standing(feet)
+    with jax.enable_x64(True):
+        x = robot.state(gait.states[phase])
+        expected = two.linearize(x, gait.inputs, exact=True)
+        forces = two.predictor.contact_forces(x, gait.inputs)
+    system = gait.system
+    for name in ("A", "B", "c"):
+        found = np.asarray(getattr(system, name)[phase])
+        np.testing.assert_allclose(found, getattr(expected, name), atol=1e-9)
+    C, D, upper = (np.asarray(v[phase]) for v in gait.cones)
+    rows = np.repeat(gait.standing[phase], 4)
+    assert np.all(np.isinf(upper[~rows])) and not C[~rows].any() and not D[~rows].any()
+    violation = (C @ gait.states[phase] + D @ gait.inputs - upper)[rows]
+    np.testing.assert_allclose(violation, two.predictor.feet.cones() @ forces, atol=1e-8)
+
+
+@pytest.mark.slow
+def test_a_quadruped_trots_in_mujoco(robot, gait):
+    """One second with the C engine as plant: at its speed, upright, all plans solved; and the same
+    run by `simulate` in MJX."""
+    Q = np.repeat([100.0, 200, 400, 200, 100, 20, 1, 0.5, 0.02], [1, 1, 1, 2, 1, 12, 3, 3, 12])
+    steps = 120
+    with jax.enable_x64(True):
+        controller = GaitController(gait, Q, np.full(12, 1e-3), horizon=30)
+        model, data = robot.mujoco, mujoco.MjData(robot.mujoco)
+        x0, _ = gait.robot.equilibrium()
+        data.qpos[:] = x0[: model.nq]
+        plan, before, states = jax.jit(lambda c, x, b: c(x, b)), controller.start(x0), [x0]
+        for _ in range(steps):
+            before = plan(controller, states[-1], before)
+            assert before.plan.status == jm.Status.SOLVED
+            data.ctrl = np.asarray(before.u)
+            for _ in range(robot.substeps):
+                mujoco.mj_step(model, data)
+            states.append(np.concatenate([data.qpos, data.qvel]))
+        run = jm.simulate(controller, robot, x0, steps)
+    states = np.array(states)
+    assert abs((states[-1, 0] - states[-45, 0]) / 0.44 - SPEED) < 0.05
+    assert np.ptp(states[:, 2]) < 0.01 and np.abs(states[:, 4:6]).max() < 0.02
+    assert np.abs(states[:, 1]).max() < 0.02
+    np.testing.assert_allclose(run.states, states, atol=1e-6)
