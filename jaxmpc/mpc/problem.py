@@ -307,13 +307,13 @@ class MPC:
 
     def volume_unit(self, axes: Sequence[int] | None = None) -> str:
         """Return the unit of volumes of these coordinates (None: those of feasible sets), with a
-        blank before it, such as " rad·rad/s"; "" where one of them has no unit."""
+        blank before it, such as " rad·rad/s" or " mg²"; "" where one of them has no unit."""
         system = self.system
         units = (system.state_units or ("",) * system.n) + (system.input_units or ("",) * system.m)
         if axes is None:
             axes = range(system.n + (system.m if self.rate_limited else 0))
         chosen = [units[i] for i in axes]
-        return " " + "·".join(chosen) if all(chosen) else ""
+        return " " + _product_unit(chosen) if all(chosen) else ""
 
     @property
     def state_stages(self) -> tuple[int, ...]:
@@ -645,6 +645,19 @@ def dynamics_of(system: LinearSystem, dtype: Any) -> tuple[Array, Array, Array]:
     xp = namespace((system.A, system.B, system.c))
     A, B = xp.asarray(system.A, dtype), xp.asarray(system.B, dtype)
     return A, B, xp.zeros(system.n, dtype) if system.c is None else xp.asarray(system.c, dtype)
+
+
+def _product_unit(units: Sequence[str]) -> str:
+    """Return the product of units: ("mg", "mg") gives "mg²", ("m/s", "rad") "(m/s)·rad"."""
+    different = list(dict.fromkeys(units))
+    factors = []
+    for unit in different:
+        power = units.count(unit)
+        ends = power == 1 and unit == different[-1]  # nothing after it could be read as divided
+        factor = unit if ends or not set(unit) & set("/ ·^") else f"({unit})"
+        raised = str(power).translate(str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹"))
+        factors.append(factor + (raised if power > 1 else ""))
+    return "·".join(factors)
 
 
 def _form(M: np.ndarray, size: np.ndarray) -> np.ndarray:

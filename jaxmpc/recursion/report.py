@@ -78,11 +78,18 @@ class RecursionReport:
                 share = f"{count / max(feasible, 1):8.3%} of the feasible{why}"
                 rows.append((f"- {name.replace('one', '1')}", f"{count:>10,}  {share}"))
         else:
-            why = "its law is proved" if self.law.holds else "no time was left for them"
-            rows.append(("samples", f"none: {why}"))
+            rows.append(("samples", f"none: {self._why_no_samples()}"))
         return "\n".join(f"  {name:<20} {value}" for name, value in rows)
 
     __repr__ = __str__
+
+    def _why_no_samples(self) -> str:
+        """Return why no loops were simulated."""
+        if self.law.holds:
+            return "its law is proved"
+        if self.mpc.disturbance is not None:
+            return "those of a robust problem are not followed; jm.simulate(..., disturbance=) does"
+        return "no time was left for them"
 
     def to_xarray(self) -> Any:
         """Return the loops as an xarray.Dataset along the dimension `sample`, names attached."""

@@ -319,7 +319,7 @@ def _closed_loop(
         vacuous = ~F.any(axis=1) & (h >= 0)
         F, h = F[~vacuous], h[~vacuous]
         if not np.all(h > 0):
-            cure = "Shift the coordinates, or widen the bounds around 0"
+            cure = "Count x and u from an equilibrium inside (docs: Around an operating point)"
             fail(argument, "the origin is not in its interior", cure)
         parts.append(F / h[:, None])
     F = np.vstack(parts)

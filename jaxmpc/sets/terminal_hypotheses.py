@@ -54,6 +54,7 @@ class TerminalReport:
         {H x <= h} with rows of norm 1, or None.
     factor: the set is mapped into itself scaled by this (an ellipsoid: into level * factor).
     exact_factor: a bound of it from the same certificate in rational arithmetic, or None.
+    disturbed: invariance was checked for every disturbance; Theorem 3 is stated for none.
     """
 
     checks: tuple[Check, ...]
@@ -61,6 +62,7 @@ class TerminalReport:
     certificate: np.ndarray | None
     factor: float | None
     exact_factor: Fraction | None
+    disturbed: bool = False
 
     def __getitem__(self, name: str) -> Check:
         """Return the check of this name."""
@@ -91,6 +93,8 @@ class TerminalReport:
             missing = [c.name for c in self.checks if number in c.theorems and not c.holds]
             answer = f"does not apply: {', '.join(missing)}" if missing else "applies"
             lines.append(f"Theorem {number} ({title}) {answer}.")
+        if self.disturbed:
+            lines.append("Theorem 3 is about w = 0: under the disturbance x need not converge.")
         lines.append("Limits of input rates, outputs and blocked moves are no part of either.")
         return "\n".join(lines)
 
@@ -195,7 +199,7 @@ def verify_terminal(
         where = "x_N may leave X, where the Lyapunov inequality and K in U do not hold"
         sentence = f"{where}: Theorem 3 requires a terminal set."
         checks.append(Check("terminal cost where x_N is free", None, None, "", sentence))
-    return TerminalReport(tuple(checks), gain, *under_K[1:])
+    return TerminalReport(tuple(checks), gain, *under_K[1:], disturbed=W is not None)
 
 
 def _gain_and_cost(

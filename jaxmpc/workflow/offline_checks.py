@@ -112,6 +112,8 @@ class OfflineReport:
             f"{counted(self.variables, 'variable')}, {counted(self.rows, 'row')}, "
             f"condition of the Hessian {self.condition:.3g}\n{limits_text(mpc)}"
         )
+        if mpc.disturbance is not None:
+            problem += f"\nlimits kept for every disturbance, by a policy of kind {mpc.policy!r}"
         samples = None
         if self.feasible_set is not None:
             low, high = self.volume
@@ -121,6 +123,8 @@ class OfflineReport:
             counts = self.feasible_set.counts().items()
             known = ", ".join(f"{count:,} {name}" for name, count in counts if count)
             samples = f"{size}samples: {known}"
+            if len(mpc.labels) > 3:
+                samples += "\nstates of the caller or random ones: not shares of the volume"
         sections = (
             ("Problem", problem, ""),
             ("Feasible set (limits hard)", samples, "feasible_set"),

@@ -164,6 +164,22 @@ upper = [1.2, 1.2]
 
 
 @pytest.mark.parametrize(
+    ("units", "expected"),
+    [
+        (("rad", "rad/s"), " rad·rad/s"),
+        (("mg",) * 4, " mg⁴"),
+        (("m/s", "rad", "rad/s", "rad"), " (m/s)·rad²·rad/s"),
+        (("m/s", "m/s"), " (m/s)²"),
+        (("m", ""), ""),
+    ],
+)
+def test_units_of_volumes_are_read_one_way_alone(units, expected):
+    n = len(units)
+    system = jm.LinearSystem(np.eye(n), np.ones((n, 1)), state_units=units)
+    assert jm.MPC(system, np.eye(n), 1.0, 2).volume_unit() == expected
+
+
+@pytest.mark.parametrize(
     ("old", "new", "message"),
     [
         ("input_rate_limit = 0.5", "input_rate_limit = [0.5, 1.0]", "limits.input_rate_limit: has"),

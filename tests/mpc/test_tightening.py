@@ -245,6 +245,7 @@ def test_recursive_feasibility_needs_a_robust_terminal_set():
     assert report.strong.holds and "all disturbances" in report.strong.reason
     report = jm.recursive_feasibility(robust(horizon=2))
     assert report.strong.holds is False and report.law.holds is None and report.weak.holds is None
+    assert "those of a robust problem are not followed" in str(report)  # not: no time was left
     H, h = np.asarray(report.feasible_set.H), np.asarray(report.feasible_set.h)
     x = report.strong.state
     assert np.all(H @ x <= h + 1e-9)

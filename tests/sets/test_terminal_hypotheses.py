@@ -107,6 +107,7 @@ def test_rational_certificates_of_dyadic_data():
     assert report.exact_factor == Fraction(3, 4) and report.factor == 0.75
     assert report.stability is True
     report = verify_terminal(**arguments, disturbance=Box([-0.25, 0], [0.25, 0.125]))
+    assert "Theorem 3 is about w = 0: under the disturbance x need not converge." in str(report)
     assert report.exact_factor == 1 and report["invariance under K"].holds is True
     report = verify_terminal(**arguments, disturbance=symmetric(0.5, 0))
     assert report.exact_factor == Fraction(5, 4)

@@ -1,5 +1,7 @@
 """The workflow as one object, on systems whose report can be told beforehand."""
 
+from dataclasses import replace
+
 import numpy as np
 import problems
 import pytest
@@ -96,6 +98,14 @@ def test_report_keeps_to_its_time(capsys):
         assert any(stage in line for line in lines)
 
 
+def test_a_report_of_a_robust_problem_says_against_what():
+    mpc = replace(problems.joint(3), disturbance=jm.Box(-0.001, 0.001), policy="affine")
+    text = str(jm.workflow.offline_report(mpc, seconds=0.01))
+    assert "every disturbance, by a policy of kind 'affine'" in text
+    assert "those of a robust problem are not followed" in text
+    assert "Theorem 3 is about w = 0" in text
+
+
 def test_a_map_that_runs_out_of_time_says_so():
     fmap = map_points(
         FeasibilityProblem.of(problems.lecture()), np.zeros((5, 2)), chunk=2, deadline=-np.inf
@@ -119,3 +129,4 @@ def test_report_of_an_ellipsoidal_and_of_a_4d_problem():
     assert report.loops.feasible == 8 and report.loops.increase <= 1e-7
     product = jm.workflow.offline_report(problems.hidden_product(3), steps=3, loops=8, seconds=20)
     assert product.feasible_set.counts()["undecided"] == 0 and product.loops.feasible <= 8
+    assert "random ones: not shares of the volume" in str(product)

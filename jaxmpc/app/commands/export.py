@@ -91,6 +91,8 @@ class Export(ExportOptions):
             found = check_fixed_steps(mpc, solver, lower, upper, self.plans, tolerance)
             share = 100 * found.reached / max(found.solvable, 1)
             summary |= dataclasses.asdict(found)
+            units = set(mpc.system.input_units or ())
+            unit = f" {units.pop()}" if len(units) == 1 else ""
             given = "" if config.solver else ", chosen, as their penalties, for 99 % below"
             if config.solver is None and self.iterations is not None:
                 given = ", given; their penalties are chosen for the share below"
@@ -100,8 +102,8 @@ class Export(ExportOptions):
                 ("ADMM steps a call", f"{solver.iterations}{given}"),
                 ("plans of closed loops", f"{found.plans}, {found.solvable} can be solved"),
                 ("solved by the C code's steps", f"{share:.1f} % of these, to {tolerance:g}"),
-                ("largest error of u where solved", f"{found.input_error:.2g}"),
-                ("largest error of u at all of these", f"{found.input_error_any:.2g}"),
+                ("largest error of u where solved", f"{found.input_error:.2g}{unit}"),
+                ("largest error of u at all of these", f"{found.input_error_any:.2g}{unit}"),
             ]
         print_table(rows, max(len(name) for name, _ in rows))
         if self.law == "jax":
