@@ -20,7 +20,8 @@ Which element of the generalised derivative is taken, and what it means where no
   yet solved) counts as a soft row with the quadratic weight k = y/violation. For an infeasible
   program the method of multipliers ends at the point that violates the rows least, with a large
   k: the derivative is that of the closest feasible program (Bambade et al. 2024, QPLayer), up to
-  about 1/k.
+  about 1/k. Violations are measured in rows of length |a_i'T|, T T' = P⁻¹, which are held fixed:
+  derivatives in P and A leave out that what counts as closest changes with them.
 """
 
 from collections.abc import Callable

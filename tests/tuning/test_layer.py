@@ -116,6 +116,41 @@ def test_inputs_without_a_plan_are_within_the_limits():
 
 
 @pytest.mark.slow
+@pytest.mark.slow
+def test_infeasible_states_have_derivatives_in_the_state_and_not_in_weights(x64):
+    """What counts as closest is held fixed: docs/how-to/learning.md gives these numbers."""
+    A = [[-0.02, 6.0, 0, -9.81], [-0.002, -0.7, 1.0, 0], [0, -1.5, -0.8, 0], [0, 0, 1.0, 0]]
+    system = jm.LinearSystem.from_continuous(A, [0, -0.05, -2.0, 0], dt=0.1)
+    most = np.array([10, 0.15, 0.5, 0.3])
+    limits = {"states": jm.Box(-most, most), "inputs": jm.Box(-0.3, 0.3)}
+    Q = np.diag([0.01, 10, 1, 10])
+    layer = jm.tuning.MPCLayer(jm.MPC(system, Q, 1.0, horizon=8, terminal_cost=Q, **limits))
+
+    def value(theta, x):
+        return jnp.linspace(1, 2, 8) @ layer(theta, x).plan.inputs[:, 0]
+
+    def slopes(function, at, step):
+        sides = [jax.vmap(function)(at + s * step * np.eye(len(at))) for s in (1, -1)]
+        return (sides[0] - sides[1]) / (2 * step)
+
+    theta, errors = layer.init(), []
+    found = jax.jit(jax.grad(value, (0, 1)))
+    states = [
+        [4, 0.2, 0.3, 0.25], [4, 0.1, 0.45, 0.29], [9, 0.14, 0.5, 0.2], [-9, -0.14, -0.5, 0.3],
+        [3, 0.1, 0.4, 0.3],
+    ]  # fmt: skip
+    for x in np.array(states):
+        assert layer(theta, x).plan.status == jm.Status.PRIMAL_INFEASIBLE
+        of_theta, of_x = found(theta, x)
+        in_x = slopes(lambda x: value(theta, x), x, 1e-5)
+        in_Q = slopes(lambda q, x=x: value(theta | {"Q": q}, x), theta["Q"], 1e-4)
+        pairs = (of_x, in_x), (of_theta["Q"], in_Q)
+        errors.append([float(np.abs(a - b).max() / np.abs(b).max()) for a, b in pairs])
+    of_state, of_weights = np.array(errors).T
+    assert of_state.max() < 5e-4
+    assert of_weights.max() > 0.5  # where this fails the derivative is whole: mend the page
+
+
 def test_the_terminal_weight_follows_what_is_learned(x64):
     """It is the P of `lqr` at every θ, beside differences; and P is a name of the terminal cost."""
     layer = jm.tuning.MPCLayer(MPC, ("Q", "R", "A"), terminal_weight="lqr")
