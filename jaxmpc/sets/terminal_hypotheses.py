@@ -446,13 +446,17 @@ def _within(
     tops = X_f.maxima(rows)[0]
     slack = g - tops
     worst = int(np.argmin(slack))
-    terms = [(f"{v:.6g} " if v != 1 else "") + labels[j] for j, v in enumerate(G[worst]) if v]
-    limit = f"{' + '.join(terms)} <= {g[worst]:.6g}"
+    sign = -1 if np.count_nonzero(G[worst]) == 1 and G[worst].sum() < 0 else 1  # x >= lower
+    row = sign * G[worst]
+    terms = [(f"{v:.6g} " if v != 1 else "") + labels[j] for j, v in enumerate(row) if v]
+    limit = f"{' + '.join(terms)} {'<=' if sign > 0 else '>='} {sign * g[worst]:.6g}"
     if np.isinf(tops[worst]):
         sentence = f"The set is unbounded, and so is the violation of {limit}."
         return Check(name, False, -np.inf, unit, sentence)
     holds = bool((slack >= -_TOUCH * np.maximum(np.abs(g), X_f.width(rows, tops))).all())
-    reached = f"The tightest limit, {limit}, is reached up to {tops[worst]:.6g} on {X_f.called}"
+    reached = (
+        f"The tightest limit, {limit}, is reached up to {sign * tops[worst]:.6g} on {X_f.called}"
+    )
     return Check(name, holds, float(slack[worst]), unit, f"{reached}.")
 
 

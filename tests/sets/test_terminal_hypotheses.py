@@ -95,6 +95,16 @@ def test_control_invariance_is_enough_for_theorem_1():
     assert "[1.5, 2. ]" in report["control invariance"].sentence
 
 
+def test_lower_limits_are_written_as_such():
+    """x >= -1 is the tightest, not -1 x <= 1: the set ends there, and 3 before the upper limit."""
+    arguments = {
+        "system": UNSTABLE, "Q": np.eye(1), "R": np.eye(1), "terminal_cost": None,
+        "terminal_set": symmetric(1), "states": Box([-1], [4]), "inputs": symmetric(2),
+    }  # fmt: skip
+    sentence = verify_terminal(**arguments)["terminal set within states"].sentence
+    assert sentence == "The tightest limit, x1 >= -1, is reached up to -1 on the terminal set."
+
+
 def test_rational_certificates_of_dyadic_data():
     # |x| <= 1 under diag(1/2, -1/4) plus a coupling of 1/4: 3/4 in the first row, exactly
     system = LinearSystem([[0.5, 0.25], [0, -0.25]], [[0.0], [1.0]])

@@ -9,7 +9,7 @@ from jaxmpc.app.options.shared import POSITIVE, Horizon, Switch, Terminal, at_le
 
 @dataclasses.dataclass(frozen=True)
 class ExportOptions:
-    """Write the controller as C code for machines without Python.
+    """Write the controller as C code, or as a stored program of JAX, to run without jaxmpc.
 
     What it does
       --law steps writes C99 code without dependencies, allocation or branches on data but for the
