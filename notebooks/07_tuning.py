@@ -203,8 +203,8 @@ assert tiny.slack.max() < 1e-6, "The slack is zero."
 assert np.allclose(tiny.inputs, plain.inputs, atol=1e-5), "The inputs are the same."
 
 # %% [markdown]
-# **Answer 2.** The plan stays; the multipliers, and with them $\bar\rho$, grow tenfold. Exact
-# penalties have the unit of the cost.
+# **Answer 2.** The plan stays; the multipliers, and with them $\bar\rho$, grow tenfold. A penalty
+# has the unit of the cost per unit of the limit that it softens.
 
 # %%
 tenfold = replace(cart, Q=10 * cart.Q, R=10 * cart.R, terminal_cost=10 * cart.terminal_cost)

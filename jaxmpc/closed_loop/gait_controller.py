@@ -1,7 +1,7 @@
 """MPC of legged robots along a gait: linear models that change as feet stand and swing."""
 
 from dataclasses import replace
-from functools import partial
+from functools import partial, reduce
 from typing import Any, NamedTuple
 
 import jax
@@ -10,7 +10,7 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.arrays import Reals, as_weight, host_array
-from jaxmpc.checks import fail, require_kind, require_symmetric_psd, whole
+from jaxmpc.checks import fail, require_kind, require_shape, require_symmetric_psd, whole
 from jaxmpc.closed_loop.feedback import one_state
 from jaxmpc.mpc.controller import zeros_of
 from jaxmpc.mpc.plan import Control, Plan, WarmStart, applied
@@ -23,9 +23,13 @@ from jaxmpc.qp.linalg import arrays, floating_dtype
 from jaxmpc.robots.gaits import Gait
 from jaxmpc.sets.convex_sets import Box
 
-# Periods of the gait after which its Riccati recursion counts as one that does not converge, and
-# the relative change below which it has.
-_PERIODS, _SETTLED = 200, 1e-9
+# The Riccati recursion over 2^40 periods of the gait counts as one that does not converge. It has
+# where another pass changes it by less than this part of its largest entry.
+_DOUBLINGS, _SETTLED = 40, 1e-9
+
+
+# A, G and H of some steps of a Riccati recursion at once: of one they are A, B R⁻¹ B' and Q.
+Steps = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 class GaitMemory(NamedTuple):
@@ -82,8 +86,12 @@ class GaitController:
             fail("margin", f"{margin}", "Give a fraction in [0, 1)")
         robot = gait.robot
         Q, R = (host_array("Q", as_weight(Q, robot.n)), host_array("R", as_weight(R, robot.m)))
+        for name, weight, size in (("Q", Q, robot.n), ("R", R, robot.m)):
+            require_shape(name, weight, (size, size), f"Or give its diagonal ({size},)")
         require_symmetric_psd("Q", Q)
         require_symmetric_psd("R", R, definite=True)
+        if solver is not None:
+            require_kind("solver", solver, ADMM)
         P = periodic_cost_to_go(gait, Q, R)
         first = {name: v[0] for name, v in _matrices(gait).items()}
         limits = MPC(
@@ -188,26 +196,45 @@ def periodic_cost_to_go(gait: Gait, Q: np.ndarray, R: np.ndarray) -> np.ndarray:
     """Return P (P, n, n): ξ'P_k ξ is the least cost of distances ξ from the motion at phase k from
     there on, Σ ξ'Qξ + u'Ru, under the linear models of the gait.
 
-    The Riccati recursion, backward through the period until it repeats itself (Bittanti, Colaneri &
-    De Nicolao 1991, 'The periodic Riccati equation').
+    The Riccati recursion backward through the period (Bittanti, Colaneri & De Nicolao 1991, 'The
+    periodic Riccati equation'), begun at its fixed point: that of 1, 2, 4, ... periods at once,
+    by doubling, as in `systems/riccati.py`. So slow gaits and large R cost no more.
     """
     A, B = (np.asarray(v, float) for v in (gait.system.A, gait.system.B))
     found = np.zeros((gait.period, *Q.shape))
-    P = Q
-    for _ in range(_PERIODS):
-        before = found[0].copy()
-        for k in reversed(range(gait.period)):
-            BtP = B[k].T @ P
-            K = -np.linalg.solve(R + BtP @ B[k], BtP @ A[k])
-            closed = A[k] + B[k] @ K
-            P = Q + closed.T @ P @ closed + K.T @ R @ K
-            found[k] = P = (P + P.T) / 2
-        if not np.all(np.isfinite(P)):
-            break
-        if np.abs(P - before).max() <= _SETTLED * np.abs(P).max():
-            return found
+    with np.errstate(all="ignore"):  # without a fixed point numbers grow beyond all bounds
+        try:
+            before = found[0]
+            steps = [(A[k], B[k] @ np.linalg.solve(R, B[k].T), Q) for k in range(gait.period)]
+            whole = reduce(_one_after_other, steps)
+            for _ in range(_DOUBLINGS):
+                if np.abs(whole[2] - before).max() <= _SETTLED * np.abs(whole[2]).max():
+                    break
+                before, whole = whole[2], _one_after_other(whole, whole)
+            P = whole[2]
+            for _ in range(3):  # the last pass checks the one before
+                before = found[0].copy()
+                for k in reversed(range(gait.period)):
+                    BtP = B[k].T @ P
+                    K = -np.linalg.solve(R + BtP @ B[k], BtP @ A[k])
+                    closed = A[k] + B[k] @ K
+                    P = Q + closed.T @ P @ closed + K.T @ R @ K
+                    found[k] = P = (P + P.T) / 2
+            if np.abs(P - before).max() <= _SETTLED * np.abs(P).max():
+                return found
+        except np.linalg.LinAlgError:
+            pass
     cure = "Weigh what it moves, or let more feet stand at a time (duty)"
     fail("gait", "has no periodic LQR: inputs do not hold all of the motion", cure)
+
+
+def _one_after_other(first: Steps, then: Steps) -> Steps:
+    """Return (A, G, H) of some steps of the Riccati recursion and of those that follow them."""
+    (A, G, H), (A_then, G_then, H_then) = first, then
+    W = np.linalg.solve(np.eye(len(A)) + G @ H_then, np.hstack([A, G]))
+    WA, WG = np.split(W, 2, axis=1)
+    G, H = G_then + A_then @ WG @ A_then.T, H + A.T @ H_then @ WA
+    return A_then @ WA, (G + G.T) / 2, (H + H.T) / 2
 
 
 def _matrices(gait: Gait) -> dict[str, Any]:

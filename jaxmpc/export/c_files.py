@@ -22,6 +22,12 @@ HEADERS = (
     "stdbool stddef stdint stdio stdlib string tgmath time wchar wctype"
 ).split()
 
+# What to give in place of a controller, to what writes programs of a problem.
+GIVE_PROBLEM = (
+    "Give a jm.MPC: controller.mpc, for an offset-free controller "
+    "jm.closed_loop.augmented(mpc, observer)"
+)
+
 
 @record
 class CFiles:

@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxmpc.arrays import Reals, host_array
 from jaxmpc.checks import fail, number, require_finite, require_kind, require_shape, whole
-from jaxmpc.export.c_files import CFiles, input_limits, literal
+from jaxmpc.export.c_files import GIVE_PROBLEM, CFiles, input_limits, literal
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.plan import Plan, WarmStart
 from jaxmpc.mpc.policy_rows import PolicyCondensed
@@ -63,7 +63,7 @@ def export_c(
     take, and files that exist, unless overwrite.
     """
     solver = ADMM() if solver is None else solver
-    require_kind("mpc", mpc, MPC)
+    require_kind("mpc", mpc, MPC, cure=GIVE_PROBLEM)
     require_kind("solver", solver, ADMM)
     files = CFiles.open(folder, name, dtype, tolerance, TOLERANCE, overwrite)
     with jax.enable_x64(True):
@@ -263,7 +263,7 @@ def check_fixed_steps(
 
     Raises ValueError for an invalid problem, bounds of another shape than (n,) and bad counts.
     """
-    require_kind("mpc", mpc, MPC)
+    require_kind("mpc", mpc, MPC, cure=GIVE_PROBLEM)
     require_kind("solver", solver, ADMM)
     mpc.require_constant("closed loops need one system for all time steps", "system")
     whole("plans", plans, 1)

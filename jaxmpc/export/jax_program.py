@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxmpc.checks import fail, require_kind, require_package
-from jaxmpc.export.c_files import prepared_paths
+from jaxmpc.export.c_files import GIVE_PROBLEM, prepared_paths
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.admm import ADMM
@@ -41,7 +41,7 @@ def export_jax(
     (the extra `export`).
     """
     require_package("flatbuffers", "export")
-    require_kind("mpc", mpc, MPC)
+    require_kind("mpc", mpc, MPC, cure=GIVE_PROBLEM)
     solver, path = ADMM() if solver is None else solver, Path(path)
     require_kind("solver", solver, ADMM)
     if dtype not in ("float64", "float32"):

@@ -17,6 +17,7 @@ import numpy as np
 
 from jaxmpc.arrays import Reals, host_array
 from jaxmpc.checks import number, require_kind, whole
+from jaxmpc.export.c_files import GIVE_PROBLEM
 from jaxmpc.export.c_solver import (
     LOOPS,
     check_fixed_steps,
@@ -65,7 +66,7 @@ def choose_steps(
     The penalties are local optima of a coarse search: `tune_solver` finds better ones. Raises
     ValueError as `check_fixed_steps` does.
     """
-    require_kind("mpc", mpc, MPC)
+    require_kind("mpc", mpc, MPC, cure=GIVE_PROBLEM)
     number("share", share, 0.0, "Give a fraction from 0 to 1")
     require_box(mpc, lower, upper)
     whole("plans", plans, 1)

@@ -22,6 +22,7 @@ Feet that stand in turn (`gaits.py`) are one model too: those that swing have no
 """
 
 import copy
+import functools
 from collections.abc import Sequence
 from functools import partial
 from typing import Any
@@ -80,7 +81,7 @@ class Feet:
         feet: names of geoms. friction: coefficient for plans, None for 80 % of the file's. Raises
         ValueError for geoms that are no spheres or do not touch.
         """
-        geoms = np.array([_foot(model, name) for name in feet])
+        geoms = np.array([_foot(model, name) for name in feet], np.int32)
         near, data = _with_margins(model, geoms), mujoco.MjData(model)
         data.qpos[:] = q
         mujoco.mj_forward(near, data)
@@ -249,9 +250,24 @@ def standing_physics(
     if equalities(model):
         problem = f"{robot.name} has equalities (couplings of joints or bodies) in its file"
         fail("robot", problem, "Models with feet that stand take none yet")
-    found = Feet.touching(robot.mujoco, np.asarray(q, float), tuple(feet), friction)
+    home = tuple(np.asarray(q, float).tolist())
+    return _standing_physics(robot.predictor, robot.mujoco, home, tuple(feet), friction)
+
+
+@functools.lru_cache(maxsize=16)
+def _standing_physics(
+    physics: Physics,
+    plant: "mujoco.MjModel",
+    home: tuple[float, ...],
+    feet: tuple[str, ...],
+    friction: float | None,
+) -> StandingPhysics:
+    """Return the model with feet that stand; the same one for the same robot, feet and friction, so
+    that programs compiled for it are found again."""
+    model = physics.model
+    found = Feet.touching(plant, np.array(home), feet, friction)
     data = mujoco.MjData(model)
-    data.qpos[:] = q
+    data.qpos[:] = home
     mujoco.mj_forward(model, data)
     sizes = np.linalg.svd(found.jacobian(model, data), compute_uv=False)
     if len(sizes) < 3 * len(found) or sizes[-1] < _RANK * sizes[0]:

@@ -19,6 +19,7 @@ import numpy as np
 
 from jaxmpc.checks import fail, number, require_finite, require_shape
 from jaxmpc.pytrees import pytree, static
+from jaxmpc.qp.jax_transformations import compiled_lightly
 from jaxmpc.robots.contacts import STANDING, linear_cones
 from jaxmpc.robots.description import host_coordinates
 from jaxmpc.robots.mujoco_access import FREE, mujoco, single_joints
@@ -108,9 +109,17 @@ def gait(
     count = round(period / robot.dt)
     if count < 4:
         fail("period", f"{period} s is {count} control periods", "Give at least 4 of them")
-    x_rest, u_rest = standing_robot.equilibrium()
+    try:
+        x_rest, u_rest = standing_robot.equilibrium()
+    except ValueError as error:
+        cure = "Name all feet that touch the ground, and put home's centre of mass above them"
+        fail("feet", f"{', '.join(feet)} do not carry {robot.name} at home ({error})", cure)
     places = _places(model, x_rest[: model.nq], feet)
-    starts = _alternating(places - x_rest[:3]) if offsets is None else np.asarray(offsets, float)
+    starts = (
+        _alternating(places - places.mean(axis=0))
+        if offsets is None
+        else np.asarray(offsets, float)
+    )
     require_shape("offsets", starts, (len(feet),), "One for each foot")
     require_finite("offsets", starts)
 
@@ -129,14 +138,9 @@ def gait(
     advance = np.zeros(robot.n)
     advance[:2] = np.asarray(velocity, float) * count * robot.dt
 
-    def models(xi: Any, stands: Any) -> tuple[LinearSystem, tuple]:
-        numbers, u = {STANDING: stands}, jnp.asarray(u_rest)
-        system = standing_robot.linearize(robot.state(xi), u, exact=True, numbers=numbers)
-        return system, linear_cones(standing_robot, numbers, xi, u)
-
     with jax.enable_x64(True):
-        found = jax.jit(jax.vmap(models))(jnp.asarray(states), jnp.asarray(standing, float))
-        system, (C, D, upper) = jax.tree.map(np.asarray, found)
+        given = (jnp.asarray(v, float) for v in (states, u_rest, standing))
+        system, (C, D, upper) = jax.tree.map(np.asarray, _models(standing_robot, *given))
     faces = np.repeat(standing, 4, axis=1)
     return Gait(
         robot=standing_robot,
@@ -150,8 +154,22 @@ def gait(
     )
 
 
+@compiled_lightly(0)
+def _models(robot: Robot, states: Any, u: Any, standing: Any) -> tuple[LinearSystem, tuple]:
+    """Return the linear models (P, ...) and the friction cones at states ξ (P, n) of rows of feet
+    that stand."""
+
+    def at(xi: Any, stands: Any) -> tuple[LinearSystem, tuple]:
+        numbers = {STANDING: stands}
+        system = robot.linearize(robot.state(xi), u, exact=True, numbers=numbers)
+        return system, linear_cones(robot, numbers, xi, u)
+
+    return jax.vmap(at)(states, standing)
+
+
 def _alternating(places: np.ndarray) -> np.ndarray:
-    """Return 0 and ½ for every other foot round the trunk; places (k, 3) from its middle."""
+    """Return 0 and ½ for every other foot round the trunk; places (k, 3) from
+    their middle."""
     order = np.argsort(np.arctan2(places[:, 1], places[:, 0]))
     starts = np.zeros(len(places))
     starts[order[1::2]] = 0.5

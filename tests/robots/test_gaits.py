@@ -75,6 +75,58 @@ def test_periodic_lqr_is_that_of_the_lifted_system():
         np.testing.assert_allclose(found, expected, rtol=1e-7)
 
 
+def test_periodic_lqr_of_a_slow_loop_is_found():
+    """A heavy R leaves an integrator so slow that hundreds of periods count: P² = R for Q, R ≫ 1.
+
+    The scalar equation P = q + P r / (r + P) has the root P = (q + √(q² + 4 q r)) / 2.
+    """
+    gait = SimpleNamespace(
+        period=2, system=SimpleNamespace(A=np.ones((2, 1, 1)), B=np.ones((2, 1, 1)))
+    )
+    q, r = 1.0, 1e6
+    found = periodic_cost_to_go(gait, np.array([[q]]), np.array([[r]]))
+    expected = (q + np.sqrt(q * q + 4 * q * r)) / 2
+    np.testing.assert_allclose(found, np.full((2, 1, 1), expected), rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("given", "text"),
+    [
+        ({"Q": np.ones(2)}, r"Q: shape \(2,\) where \(3, 3\)"),
+        ({"R": 1.0}, r"R: shape \(\) where \(2, 2\)"),
+        ({"solver": 3}, "solver: is a int"),
+    ],
+)
+def test_weights_and_solvers_that_do_not_fit_are_named(given, text):
+    """Before the LQR is looked for."""
+    gait = random_gait(np.random.default_rng(2), 3, same=True)
+    stand_in = jm.robots.Gait(
+        SimpleNamespace(n=3, m=2), None, np.zeros((3, 3)), None, None, gait.system, None
+    )
+    with pytest.raises(ValueError, match=text):
+        GaitController(stand_in, **{"Q": np.ones(3), "R": np.ones(2), **given})
+
+
+def test_models_of_feet_are_traced_in_either_precision(robot):
+    """In float32 too, after float64: a loop with a delay predicts so between its samples."""
+    standing = robot.standing(FEET)
+    x, u = np.asarray(robot.home), np.zeros(robot.m)
+    for precise in (True, False):
+        with jax.enable_x64(precise):
+            step = jax.jit(lambda x, u: standing.predictor.step(x, u))
+            found = jax.eval_shape(step, x.astype(np.float32), u.astype(np.float32))
+        assert found.shape == x.shape
+
+
+def test_feet_that_carry_nothing_are_named(robot):
+    """Two of four feet; and the same feet give the same model, whose programs are found again."""
+    with pytest.raises(
+        ValueError, match=r"(?s)feet: FL, FR do not carry quadruped at home.*Name all"
+    ):
+        jm.robots.gait(robot, ("FL", "FR"))
+    assert robot.standing(FEET).predictor is robot.standing(FEET).predictor
+
+
 def test_gaits_without_an_lqr_are_refused():
     gait = random_gait(np.random.default_rng(2), 3, same=True)
     gait.system.B = 0 * gait.system.B
