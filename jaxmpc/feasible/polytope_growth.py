@@ -160,10 +160,10 @@ def backward(
     whose limits couple few of them. Only for limits on states and inputs at the standard steps.
     """
     last: Any = mpc.terminal_set
-    if mpc.disturbance is not None:
-        return "in more than four dimensions the facets of a robust problem are not enumerated"
     if mpc.rate_limited:
         return RATES
+    if mpc.disturbance is not None:
+        return "in more than four dimensions the facets of a robust problem are not enumerated"
     if (
         not is_standard_form(mpc)
         or not mpc.constrain_initial

@@ -238,6 +238,16 @@ def test_stored_labels_are_verified_in_fractions(tmp_path):
     assert any(differ) and len(outer)
 
 
+def test_rates_of_a_robust_problem_of_many_states_name_their_cure():
+    system = jm.LinearSystem(0.5 * np.eye(4), np.ones(4))
+    mpc = jm.MPC(
+        system, np.eye(4), 1.0, 3, states=jm.Box(-np.ones(4), np.ones(4)), inputs=jm.Box(-1, 1),
+        input_rate_limit=0.5, disturbance=jm.Box(-0.01, 0.01),
+    )  # fmt: skip
+    with pytest.raises(ValueError, match="Make u_{k-1} a state and its change the input"):
+        jm.feasible_polytope(mpc)
+
+
 def test_recursive_feasibility_needs_a_robust_terminal_set():
     K, W = jm.lqr(SYSTEM, np.eye(2), 0.1).K, jm.Box([-0.15] * 2, [0.15] * 2)
     good = jm.maximal_invariant_set(SYSTEM, K, X, U, disturbance=W)
