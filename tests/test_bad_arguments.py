@@ -85,7 +85,10 @@ CALLS = [
     ("mpc: is a int. Give a jm.MPC", lambda: jm.Controller(3).plan(x)),
     ("solver: is a str. Give a jm.ADMM", lambda: jm.Controller(M, "s")),
     ("qp: is a int. Give a jm.QP", lambda: jm.solve_qp(3)),
-    ("mpc: is a int.*jm.closed_loop.augmented", lambda: jm.export.export_c(3, "nowhere")),
+    (
+        "mpc: is a int. Give a jm.MPC: controller.mpc, for an offset-free controller jm.closed_loop",
+        lambda: jm.export.export_c(3, "nowhere"),
+    ),
     ("qp: is a str. Give a jm.QP", lambda: jm.solve_qp("qp")),
     ("qp: is a NoneType. Give a jm.QP", lambda: jm.solve_qp(None)),
     ("qp: is a MPC. Give a jm.QP", lambda: jm.solve_qp(M)),

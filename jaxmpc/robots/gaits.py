@@ -111,9 +111,9 @@ def gait(
         fail("period", f"{period} s is {count} control periods", "Give at least 4 of them")
     try:
         x_rest, u_rest = standing_robot.equilibrium()
-    except ValueError as error:
+    except ValueError:  # which says what is missing
         cure = "Name all feet that touch the ground, and put home's centre of mass above them"
-        fail("feet", f"{', '.join(feet)} do not carry {robot.name} at home ({error})", cure)
+        fail("feet", f"{', '.join(feet)} do not carry {robot.name} at home", cure)
     places = _places(model, x_rest[: model.nq], feet)
     starts = (
         _alternating(places - places.mean(axis=0))
