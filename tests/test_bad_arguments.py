@@ -86,7 +86,7 @@ CALLS = [
     ("solver: is a str. Give a jm.ADMM", lambda: jm.Controller(M, "s")),
     ("qp: is a int. Give a jm.QP", lambda: jm.solve_qp(3)),
     (
-        "mpc: is a int. Give a jm.MPC: controller.mpc, for an offset-free controller jm.closed_loop",
+        "mpc: is a int. Give a jm.MPC: controller.mpc, for an offset-free controller jm.closed",
         lambda: jm.export.export_c(3, "nowhere"),
     ),
     ("qp: is a str. Give a jm.QP", lambda: jm.solve_qp("qp")),
