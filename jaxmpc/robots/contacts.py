@@ -189,6 +189,7 @@ class StandingPhysics(Physics):
     def contact_forces(self, x: Array, u: Array, numbers: dict[str, Array] | None = None) -> Array:
         """Return the contact forces λ (3k,), normal and two tangential ones of each foot (N), at
         x = (qpos, qvel, act) under u. numbers: as in `step`."""
+        x, u = jnp.asarray(x), jnp.asarray(u)
         q, v, act = jnp.split(x, [self.model.nq, self.model.nq + self.model.nv])
         return self._standing(numbers or {}, normalised(self.joints, q), v, act, u)[1]
 

@@ -191,7 +191,7 @@ def test_linear_models_are_those_of_the_feet_that_stand(robot, gait):
     with jax.enable_x64(True):
         x = robot.state(gait.states[phase])
         expected = two.linearize(x, gait.inputs, exact=True)
-        forces = two.predictor.contact_forces(x, gait.inputs)
+        forces = np.asarray(two.predictor.contact_forces(x, gait.inputs))
     system = gait.system
     for name in ("A", "B", "c"):
         found = np.asarray(getattr(system, name)[phase])
