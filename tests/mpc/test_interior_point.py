@@ -1,14 +1,31 @@
 """The interior point method stage by stage where its steps used to become short."""
 
+import cvxpy as cp
 import jax
 import numpy as np
 
 import jaxmpc as jm
 
 
+def least_cost(mpc, x0):
+    """The optimal value, by Clarabel."""
+    system, N = mpc.system, mpc.horizon
+    x, u = cp.Variable((N + 1, system.n)), cp.Variable((N, system.m))
+    cost, rows = 0.0, [x[0] == x0, cp.abs(u) <= mpc.inputs.upper[None, :]]
+    for k in range(N):
+        rows.append(x[k + 1] == system.A @ x[k] + system.B @ u[k])
+        cost += cp.quad_form(x[k], mpc.Q) + cp.quad_form(u[k], mpc.R)
+    [soft] = mpc.soft
+    for k in soft.stages:
+        violation = cp.pos(soft.C @ x[k] - soft.upper) + cp.pos(soft.lower - soft.C @ x[k])
+        cost += cp.sum(cp.multiply(soft.rho, violation))
+    problem = cp.Problem(cp.Minimize(cost), rows)
+    return problem.solve(solver="CLARABEL", tol_gap_rel=1e-10, tol_feas=1e-10)
+
+
 def test_plans_from_far_outside_soft_limits_are_solved():
     """States up to 2.5 times beyond soft limits of a small weight, of which most plans once ended
-    at the limit of steps; the plans are those of the condensed problem."""
+    at the limit of steps; their costs are least."""
     rng, k, count = np.random.default_rng(0), 2, 8
     W, G = rng.normal(size=(2, k, k))
     inverse = np.linalg.inv(np.eye(k) + W @ W.T / k)
@@ -25,6 +42,5 @@ def test_plans_from_far_outside_soft_limits_are_solved():
         solver = jm.ADMM(iterations=0)
         plan = jax.jit(jax.vmap(lambda x: jm.mpc.solve_stagewise(soft, x, solver=solver)))(x0s)
     assert np.all(plan.status == jm.Status.SOLVED)
-    expected = jm.solve_many(soft, x0s)
-    np.testing.assert_allclose(plan.cost, expected.cost, rtol=1e-6)
-    np.testing.assert_allclose(plan.inputs, expected.inputs, atol=2e-5)
+    for x0, cost in zip(x0s, plan.cost, strict=True):
+        np.testing.assert_allclose(cost, least_cost(soft, x0), rtol=1e-6)
