@@ -10,7 +10,7 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.arrays import Reals, as_weight, host_array
-from jaxmpc.checks import fail, require_kind, require_shape, require_symmetric_psd, whole
+from jaxmpc.checks import fail, number, require_kind, require_shape, require_symmetric_psd, whole
 from jaxmpc.closed_loop.feedback import one_state
 from jaxmpc.mpc.controller import zeros_of
 from jaxmpc.mpc.plan import Control, Plan, WarmStart, applied
@@ -84,6 +84,7 @@ class GaitController:
         whole("horizon", horizon, 1)
         if not 0 <= margin < 1:
             fail("margin", f"{margin}", "Give a fraction in [0, 1)")
+        number("rho", rho, 0.0, "Weights are at least 0")
         robot = gait.robot
         Q, R = (host_array("Q", as_weight(Q, robot.n)), host_array("R", as_weight(R, robot.m)))
         for name, weight, size in (("Q", Q, robot.n), ("R", R, robot.m)):

@@ -204,7 +204,7 @@ def _joints(model: Any, home: np.ndarray, feet: Sequence[str], goals: np.ndarray
     data, J = mujoco.MjData(model), np.zeros((3, model.nv))
     geoms = [model.geom(name).id for name in feet]
     lower, upper = np.where(model.jnt_limited[:, None], model.jnt_range, [-np.inf, np.inf]).T
-    q, found = home.copy(), []
+    q, found, at_home = home.copy(), [], _places(model, home, feet)
     for goal in goals:
         for _ in range(_STEPS):
             data.qpos[:] = q
@@ -217,15 +217,17 @@ def _joints(model: Any, home: np.ndarray, feet: Sequence[str], goals: np.ndarray
                 mujoco.mj_jacGeom(model, data, J, None, geom)
                 rows.append(J[:, 6:].copy())
             q[7:] += np.linalg.lstsq(np.vstack(rows), away.ravel(), rcond=1e-6)[0]
-        missed = np.linalg.norm(away, axis=1)
+        missed = np.abs(away).max(axis=1)
         worst = int(np.argmax(missed))
         problem = ""
-        if missed[worst] > _REACHED:
+        if missed[worst] >= _REACHED:
             problem = f"geom {feet[worst]} stays {missed[worst]:.3g} m from its step"
         elif np.any((q[7:] < lower[1:]) | (q[7:] > upper[1:])):
             joint = int(np.argmax(np.maximum(lower[1:] - q[7:], q[7:] - upper[1:]))) + 1
             problem = f"joint {model.joint(joint).name} would pass its limits"
         if problem:
-            fail("velocity", problem, "Give a smaller velocity, lift, or a shorter period")
+            along, up = np.abs(goal - at_home).max(axis=0)[:2].max(), (goal - at_home)[:, 2].max()
+            cure = "Give a smaller velocity, lift, or a shorter period"
+            fail("lift" if up > along else "velocity", problem, cure)
         found.append(q.copy())
     return np.array(found)

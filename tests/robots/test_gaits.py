@@ -95,6 +95,7 @@ def test_periodic_lqr_of_a_slow_loop_is_found():
         ({"Q": np.ones(2)}, r"Q: shape \(2,\) where \(3, 3\)"),
         ({"R": 1.0}, r"R: shape \(\) where \(2, 2\)"),
         ({"solver": 3}, "solver: is a int"),
+        ({"rho": -1.0}, "rho: -1.0"),
     ],
 )
 def test_weights_and_solvers_that_do_not_fit_are_named(given, text):
@@ -132,7 +133,7 @@ def test_gaits_without_an_lqr_are_refused():
         ({"lift": 0.0}, "lift: "),
         ({"offsets": (0.0, 0.5)}, r"offsets: shape \(2,\)"),
         ({"velocity": (4.0, 0.0)}, r"velocity: .*(stays|limits).*smaller velocity"),
-        ({"lift": 0.5}, r"velocity: .*(stays|limits).*lift"),
+        ({"lift": 0.5}, r"lift: .*(stays|limits).*lift"),
         ({"feet": ("FL", "nose")}, "feet: "),
     ],
 )
