@@ -95,20 +95,27 @@ class Rest:
         return self.mass * rate * longer * np.nanmin(far, axis=1)
 
 
-def pushes(robot: Any, rest: Rest, impulses: np.ndarray, steps: int) -> np.ndarray:
-    """Return the disturbances (count, steps, n) that pushes of these impulses (count, 2) are."""
-    first, last = round(BEFORE / robot.dt), round((BEFORE + PUSH) / robot.dt)
+def pushes(
+    robot: Any, rest: Rest, impulses: np.ndarray, steps: int, before: float = BEFORE
+) -> np.ndarray:
+    """Return the disturbances (count, steps, n) that pushes of these impulses (count, 2) are, after
+    so many seconds."""
+    first, last = round(before / robot.dt), round((before + PUSH) / robot.dt)
     added = np.zeros((len(impulses), steps, robot.state_size))
     change = impulses @ rest.by_impulse[:, :2].T / (last - first)
     added[:, first:last, robot.mujoco.nq :] = change[:, None]
     return added
 
 
-def stood(states: np.ndarray) -> np.ndarray:
-    """Return which robots (count,) stand, from their states (count, T+1, nq + nv)."""
+def upright(states: np.ndarray) -> np.ndarray:
+    """Return which robots (count,) stay on their feet, from their states (count, T+1, nq + nv)."""
     up = 1 - 2 * (states[:, :, 4] ** 2 + states[:, :, 5] ** 2)
-    high = np.all((states[:, :, 2] > 0.15) & (up > np.cos(np.pi / 4)), axis=1)
-    return high & (np.linalg.norm(states[:, -1, 19:22], axis=1) < 0.1)
+    return np.all((states[:, :, 2] > 0.15) & (up > np.cos(np.pi / 4)), axis=1)
+
+
+def stood(states: np.ndarray) -> np.ndarray:
+    """Return which robots (count,) stand in the end."""
+    return upright(states) & (np.linalg.norm(states[:, -1, 19:22], axis=1) < 0.1)
 
 
 def of_feet(robot: Any, run: Run) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

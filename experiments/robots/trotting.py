@@ -12,13 +12,12 @@ the plant, and the first robot's whole run with the C engine in the place of the
 import argparse
 import time
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from standing import FEET, FILE, Rest, film, of_feet
+from standing import FEET, FILE, Rest, film, of_feet, pushes, upright
 
 import jaxmpc as jm
 from jaxmpc.closed_loop import GaitController
@@ -26,21 +25,6 @@ from jaxmpc.closed_loop import GaitController
 # Weights of position, orientation, joints, and their velocities; and of torques.
 Q = np.repeat([100.0, 200, 400, 200, 100, 20, 1, 0.5, 0.02], [1, 1, 1, 2, 1, 12, 3, 3, 12])
 R = np.full(12, 1e-3)
-
-
-def pushes(robot: Any, rest: Rest, impulses: np.ndarray, steps: int) -> np.ndarray:
-    """Return the disturbances (count, steps, n) that pushes of these impulses (count, 2) are."""
-    first, last = steps // 2, steps // 2 + round(0.1 / robot.dt)
-    added = np.zeros((len(impulses), steps, robot.state_size))
-    change = impulses @ rest.by_impulse[:, :2].T / (last - first)
-    added[:, first:last, robot.mujoco.nq :] = change[:, None]
-    return added
-
-
-def trotted(states: np.ndarray) -> np.ndarray:
-    """Return which robots (count,) stay on their feet, from their states (count, T+1, nq + nv)."""
-    up = 1 - 2 * (states[:, :, 4] ** 2 + states[:, :, 5] ** 2)
-    return np.all((states[:, :, 2] > 0.15) & (up > np.cos(np.pi / 4)), axis=1)
 
 
 def on_c_engine(controller: GaitController, x: np.ndarray, steps: int) -> np.ndarray:
@@ -80,12 +64,12 @@ def main() -> None:
     impulses = size[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     steps = round(given.seconds / robot.dt)
     began = time.perf_counter()
-    added = pushes(robot, rest, impulses, steps)
+    added = pushes(robot, rest, impulses, steps, before=given.seconds / 2)
     run = jm.simulate_many(
         controller, robot, np.tile(x, (given.count, 1)), steps, disturbances=added
     )
     print(f"simulated in {time.perf_counter() - began:.0f} s, compiling included", flush=True)
-    well, half = trotted(run.states), steps // 2
+    well, half = upright(run.states), steps // 2
     print(f"{well.mean():.1%} of {given.count} trot; by impulse, N s: ", end="")
     ends = np.linspace(0, given.push, 6)
     groups = np.clip(np.digitize(size, ends) - 1, 0, 4)
