@@ -12,6 +12,7 @@ from jax import Array
 from jaxmpc.arrays import Reals, as_weight, host_array
 from jaxmpc.checks import fail, number, require_kind, require_shape, require_symmetric_psd, whole
 from jaxmpc.closed_loop.feedback import one_state
+from jaxmpc.closed_loop.robot_controller import FORCES
 from jaxmpc.mpc.controller import zeros_of
 from jaxmpc.mpc.plan import Control, Plan, WarmStart, applied
 from jaxmpc.mpc.problem import MPC, Soft, as_tuple, soften
@@ -143,10 +144,9 @@ class GaitController:
             jax.tree.map(lambda v: v[phases], part) for part in (_matrices(gait), gait.cones)
         )
         size = jnp.max(jnp.abs(gait.cones.D), axis=(0, 2))
-        weight = 100 * jnp.max(jnp.asarray(self.rho)) / jnp.where(size > 0, size, 1.0)
-        friction = Soft(
-            cones.C, None, cones.upper, weight, 0.0, cones.D, tuple(range(N)), _labels(gait)
-        )
+        weight = FORCES * jnp.max(jnp.asarray(self.rho)) / jnp.where(size > 0, size, 1.0)
+        names = self.robot.predictor.feet.cone_names
+        friction = Soft(cones.C, None, cones.upper, weight, 0.0, cones.D, tuple(range(N)), names)
         last = self.cost_to_go[(time + N) % gait.period]
         return replace(
             self.mpc,
@@ -241,7 +241,3 @@ def _one_after_other(first: Steps, then: Steps) -> Steps:
 def _matrices(gait: Gait) -> dict[str, Any]:
     """Return A, B and c of the linear models."""
     return {name: getattr(gait.system, name) for name in ("A", "B", "c")}
-
-
-def _labels(gait: Gait) -> tuple[str, ...]:
-    return tuple(f"friction cone of {name}" for name in gait.names for _ in range(4))

@@ -422,7 +422,7 @@ def as_model(robot: Any, exact: bool = True) -> Any:
 
 
 # How much more than a violated limit of a state a violated limit of a force costs.
-_FORCES = 100
+FORCES = 100
 
 
 def _softened(mpc: MPC, rho: Reals) -> MPC:
@@ -439,7 +439,7 @@ def _softened(mpc: MPC, rho: Reals) -> MPC:
             )
             size = np.where(of_inputs > 0, of_inputs, of_states)
             names = rows.stages, rows.names, rows.units
-            weight = _FORCES * xp.max(rho) / size
+            weight = FORCES * xp.max(rho) / size
             heavy.append(Soft(rows.C, rows.lower, rows.upper, weight, 0.0, rows.D, *names))
     return replace(soft, soft=(*as_tuple("soft", soft.soft, Soft), *heavy))
 

@@ -120,6 +120,11 @@ class Feet:
             rows.append(frame @ J)
         return np.concatenate(rows)
 
+    @property
+    def cone_names(self) -> tuple[str, ...]:
+        """Return the names of the faces of the friction cones, four a foot."""
+        return tuple(f"friction cone of {name}" for name in self.names for _ in range(4))
+
     def cones(self) -> np.ndarray:
         """Return the faces (4k, 3k) of the friction cones, F λ ≤ 0: ±λ_1 ± λ_2 ≤ μ λ_n."""
         signs = [(1, 1), (1, -1), (-1, 1), (-1, -1)]
@@ -288,7 +293,7 @@ def friction_cones(robot: RobotDescription, x: Any, u: Any) -> ForceLimits | Non
     with jax.enable_x64(True):
         xi, u = robot.coordinates(jnp.asarray(x, float)), jnp.asarray(u, float)
         C, D, upper = map(np.asarray, jax.jit(partial(linear_cones, robot, {}))(xi, u))
-    labels = tuple(f"friction cone of {name}" for name in physics.feet.names for _ in range(4))
+    labels = physics.feet.cone_names
     units = ("N",) * len(labels)
     return ForceLimits(C, upper=upper, D=D, stages=None, names=labels, units=units)
 

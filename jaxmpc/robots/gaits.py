@@ -168,8 +168,7 @@ def _models(robot: Robot, states: Any, u: Any, standing: Any) -> tuple[LinearSys
 
 
 def _alternating(places: np.ndarray) -> np.ndarray:
-    """Return 0 and ½ for every other foot round the trunk; places (k, 3) from
-    their middle."""
+    """Return 0 and ½ for every other foot round the trunk; places (k, 3) from their middle."""
     order = np.argsort(np.arctan2(places[:, 1], places[:, 0]))
     starts = np.zeros(len(places))
     starts[order[1::2]] = 0.5
