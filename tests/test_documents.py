@@ -105,6 +105,7 @@ def holds_learning(after, said):
     assert after[4]["states"].shape == (64, 20, 2)
     assert "'inputs.upper': (5,)" in said and after[7]["plans"].inputs.shape == (3, 5, 1)
     assert after[7]["plans"].solved.all()
+    assert after[9]["proof"].kept > 0.99 and after[9]["proof"].broken < 1e-3
 
 
 def holds_theory(after, said):

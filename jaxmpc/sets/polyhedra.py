@@ -209,6 +209,17 @@ def closest(G: np.ndarray, g: np.ndarray, x: np.ndarray) -> np.ndarray:
     return x + u
 
 
+def triangulation(vertices: np.ndarray) -> np.ndarray:
+    """Return simplices (K, k+1, k) that make up the hull of vertices (V, k), which span R^k."""
+    if vertices.shape[1] == 1:
+        return np.array([[[vertices.min()], [vertices.max()]]])
+    scaled = (vertices - vertices.mean(axis=0)) / np.ptp(vertices, axis=0)
+    try:
+        return vertices[Delaunay(scaled).simplices]
+    except QhullError:
+        return vertices[Delaunay(scaled, qhull_options="QJ").simplices]
+
+
 def spread(vertices: np.ndarray, count: int, random: np.random.Generator) -> np.ndarray:
     """Return points (count, k) uniformly distributed over the hull of vertices that span R^k: a
     simplex of a triangulation by its volume, then a point in it."""
@@ -219,11 +230,7 @@ def spread(vertices: np.ndarray, count: int, random: np.random.Generator) -> np.
         problem = f"has dimension {k}, and samples are drawn in up to {TRIANGULATED}"
         fail("sample", problem, "Draw from bounding_box() and keep what the set contains")
     center, scale = vertices.mean(axis=0), np.ptp(vertices, axis=0)
-    scaled = (vertices - center) / scale
-    try:
-        simplices = scaled[Delaunay(scaled).simplices]
-    except QhullError:
-        simplices = scaled[Delaunay(scaled, qhull_options="QJ").simplices]
+    simplices = (triangulation(vertices) - center) / scale
     size = np.abs(np.linalg.det(simplices[:, 1:] - simplices[:, :1]))
     which = random.choice(len(size), count, p=size / size.sum())
     weights = random.dirichlet(np.ones(k + 1), count)

@@ -1,0 +1,207 @@
+"""What is proved of a network in the place of an MPC: the share of a set of states from which its
+input leads into a set.
+
+The set is cut into simplices (Delaunay). Over one of them each quantity q(x) of the network is
+enclosed by an affine function, q(x) in M x + t ± r, as in zonotopes (Singh et al. 2018, NeurIPS);
+an affine function is largest at a corner. Layers are affine, and max(z, 0) of a z between a < 0 and
+b > 0 lies in slope z + [0, −slope a] with slope = b / (b − a). A simplex in which the next state
+keeps every half-space is proved, one in which it breaks one everywhere is refuted; others are cut
+in two at their longest edge.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxmpc.arrays import host_array
+from jaxmpc.checks import fail, require_finite, require_kind, require_shape, whole
+from jaxmpc.pytrees import record
+from jaxmpc.sets.convex_sets import Box
+from jaxmpc.sets.linear_sets import LinearSet, as_polytope
+from jaxmpc.sets.polyhedra import TRIANGULATED, triangulation
+from jaxmpc.systems.system import LinearSystem, host_matrices
+
+# Simplices that a program takes at once.
+PART = 8192
+# What half-spaces of length one, in units of the set's size, have to keep beside rounding: sums of
+# float64 err by some 1e-13 here.
+MARGIN = 1e-9
+
+# Quantities (k,) over a simplex: M (k, n), t (k,), r (k,).
+Enclosure = tuple[Array, Array, Array]
+
+
+@record
+class NetworkProof:
+    """What is proved of the next states of a set, in shares of its volume that add up to 1.
+
+    kept: the input leads into the target. broken: it leads elsewhere. undecided: neither is
+    proved. cells: simplices that were looked at. open_cells (K, n+1, n): corners of those that are
+    undecided.
+    """
+
+    kept: float
+    broken: float
+    undecided: float
+    cells: int
+    open_cells: np.ndarray
+
+    def __repr__(self) -> str:
+        return (
+            f"NetworkProof: {self.kept:.4%} of the volume proved to keep the target, "
+            f"{self.broken:.4%} to miss it, {self.undecided:.4%} undecided ({self.cells:,} cells)"
+        )
+
+
+def prove_network(
+    network: Sequence[tuple[Any, Any]],
+    system: LinearSystem,
+    states: LinearSet,
+    inputs: Box,
+    *,
+    target: LinearSet | None = None,
+    cells: int = 300_000,
+) -> NetworkProof:
+    """Prove for which share of a set of states a network's input leads into a set.
+
+    Arguments:
+        network: (W, b) of each layer, W (units, inputs of the layer) and b (units,), with
+            max(·, 0) between layers. The input is the output of the last one, clipped to `inputs`.
+        system: x⁺ = A x + B u + c.
+        states: bounded set with volume, in up to six dimensions. In a control invariant set, such
+            as `jm.sets.maximal_control_invariant_set`, the network keeps all limits for ever where
+            every share but `kept` is zero; elsewhere it does for one more step.
+        inputs: limits of the inputs, finite.
+        target: where the next state has to be; None: in `states`. Under disturbances E w, w in W,
+            give `states.pontryagin_difference(W.image(E))`.
+        cells: that are looked at, at most.
+
+    All states of a cell that counts as kept keep every half-space of the target by 1e-9 of the
+    set's size, far more than float64 errs here; roundings themselves are not enclosed. States with
+    one input alone that leads into the target stay undecided, however small the cells are.
+
+    Raises ValueError for wrong arguments, and sets that are empty, flat or unbounded.
+    """
+    require_kind("system", system, LinearSystem)
+    require_kind("inputs", inputs, Box)
+    n, m = system.n, system.m
+    whole("cells", cells, 1)
+    inputs.validate("inputs", m)
+    low, high = inputs.bounds("inputs")
+    if not np.all(np.isfinite(low) & np.isfinite(high)):
+        fail("inputs", "are unbounded", "Give finite limits, to which the network's input is cut")
+    system.validate()
+    body = as_polytope("states", states, n).require_body("states")
+    if n > TRIANGULATED:
+        problem = f"has dimension {n}, and simplices are made in up to {TRIANGULATED}"
+        fail("states", problem, "Prove a system of fewer states")
+    goal = body if target is None else as_polytope("target", target, n)
+    layers = _checked(network, n, m)
+
+    vertices = body.vertices()
+    left = triangulation(vertices)
+    size = vertices.max(axis=0) - vertices.min(axis=0)
+    H, h = (np.asarray(part, float) for part in goal.half_spaces())
+    length = np.abs(H * size).sum(axis=1)
+    H, h = H / length[:, None], h / length  # in units of the set's size
+    A, B, c = host_matrices(system)
+    with jax.enable_x64(True):
+        last = H @ A, H @ B, H @ c - h
+        network64 = jax.tree.map(jnp.asarray, (layers, (low, high), last))
+        bounds = jax.jit(jax.vmap(excess_bounds, (None, 0)))
+        whole_volume, kept, broken, count = float(_volumes(left).sum()), 0.0, 0.0, 0
+        while len(left) and count + len(left) <= cells:
+            room = -len(left) % PART
+            padded = np.concatenate([left, np.repeat(left[:1], room, axis=0)])
+            parts = [bounds(network64, padded[i : i + PART]) for i in range(0, len(padded), PART)]
+            least, most = (np.concatenate(v)[: len(left)] for v in zip(*parts, strict=True))
+            count += len(left)
+            volume, proved, refuted = _volumes(left), most <= -MARGIN, least >= MARGIN
+            kept += float(volume[proved].sum())
+            broken += float(volume[refuted].sum())
+            left = _halves(left[~proved & ~refuted], size)
+    undecided = float(_volumes(left).sum())
+    return NetworkProof(
+        kept / whole_volume, broken / whole_volume, undecided / whole_volume, count, left
+    )
+
+
+def excess_bounds(network: Any, corners: Array) -> tuple[Array, Array]:
+    """Return bounds of max(F x + G u(x) + g) over a simplex: a number that it is nowhere below, and
+    one that it is nowhere above.
+
+    network: the layers, (low, high) to which the input is clipped, and (F, G, g). corners
+    (n+1, n).
+    """
+    layers, (low, high), (F, G, g) = network
+
+    def ends(M: Array, t: Array, r: Array) -> tuple[Array, Array]:
+        values = corners @ M.T + t
+        return jnp.min(values, axis=0) - r, jnp.max(values, axis=0) + r
+
+    def affine(W: Array, b: Array, found: Enclosure) -> Enclosure:
+        M, t, r = found
+        return W @ M, W @ t + b, jnp.abs(W) @ r
+
+    def rectified(found: Enclosure) -> Enclosure:
+        (M, t, r), (a, b) = found, ends(*found)
+        split = (a < 0) & (b > 0)
+        slope = jnp.where(split, b / jnp.where(split, b - a, 1.0), jnp.where(a >= 0, 1.0, 0.0))
+        half = jnp.where(split, -slope * a / 2, 0.0)
+        return slope[:, None] * M, slope * t + half, slope * r + half
+
+    n = corners.shape[1]
+    found = jnp.eye(n), jnp.zeros(n), jnp.zeros(n)
+    for W, b in layers[:-1]:
+        found = rectified(affine(W, b, found))
+    # The clipped input is high − max(high − low − max(z − low, 0), 0).
+    W, b = layers[-1]
+    minus = -jnp.eye(len(b))
+    above = rectified(affine(W, b - low, found))
+    M, t, r = affine(G @ minus, G @ high + g, rectified(affine(minus, high - low, above)))
+    least, most = ends(M + F, t, r)
+    return jnp.max(least), jnp.max(most)
+
+
+def _checked(network: Any, n: int, m: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return the layers as float64 arrays, or raise ValueError."""
+    try:
+        layers = [(host_array("network", W), host_array("network", b)) for W, b in network]
+    except (TypeError, ValueError):
+        layers = []
+    if not layers:
+        fail("network", "is no sequence of (W, b)", "Give the arrays of each layer, first to last")
+    units = n
+    for i, (W, b) in enumerate(layers):
+        if W.ndim != 2 or W.shape[1] != units:
+            cure = f"Give (units, {units}): one row a unit; of kernels (in, out) give the transpose"
+            fail(f"network[{i}][0]", f"shape {W.shape}", cure)
+        require_shape(f"network[{i}][1]", b, (len(W),), "One number for each row of W")
+        require_finite(f"network[{i}][0]", W)
+        require_finite(f"network[{i}][1]", b)
+        units = len(W)
+    if units != m:
+        fail("network", f"has {units} outputs for {m} inputs", "One row of the last W an input")
+    return layers
+
+
+def _volumes(corners: np.ndarray) -> np.ndarray:
+    """Return the volumes (K,) of simplices (K, n+1, n), up to the factor n!."""
+    return np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1]))
+
+
+def _halves(corners: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """Return both halves of each simplex, cut in the middle of the edge that is longest in the
+    units `size` (n,) of the coordinates."""
+    i, j = np.triu_indices(corners.shape[1], 1)
+    edges = ((corners[:, i] - corners[:, j]) / size) ** 2
+    longest = np.argmax(edges.sum(axis=2), axis=1)
+    each, i, j = np.arange(len(corners)), i[longest], j[longest]
+    middle = (corners[each, i] + corners[each, j]) / 2
+    one, two = corners.copy(), corners.copy()
+    one[each, i], two[each, j] = middle, middle
+    return np.concatenate([one, two])
