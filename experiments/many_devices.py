@@ -40,8 +40,8 @@ from jaxmpc.feasible.pipeline import compiled_hull
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.stagewise.nonlinear import as_argument
 from jaxmpc.tuning.losses import ClosedLoopLoss
+from jaxmpc.tuning.objective import ClosedLoopObjective
 from jaxmpc.tuning.parameters import Parameter, raw
-from jaxmpc.tuning.weights import ClosedLoopObjective
 
 # The batches of each kind of work, and the least number of times that one device is asked for, by
 # number of devices.

@@ -31,8 +31,8 @@ import jaxmpc as jm
 from jaxmpc.batches import Compiled
 from jaxmpc.mpc.stagewise.nonlinear import as_argument
 from jaxmpc.tuning.losses import ClosedLoopLoss
+from jaxmpc.tuning.objective import ClosedLoopObjective
 from jaxmpc.tuning.parameters import Parameter, raw
-from jaxmpc.tuning.weights import ClosedLoopObjective
 
 JOINT = Joint()
 # Of the reference: at 1e-5 it steps across a change of active rows in one loop of 256, and the

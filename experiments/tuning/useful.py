@@ -39,8 +39,9 @@ from jaxmpc.batches import Compiled
 from jaxmpc.mpc.stagewise.nonlinear import as_argument
 from jaxmpc.robots.robot import Robot
 from jaxmpc.tuning.losses import ClosedLoopLoss
+from jaxmpc.tuning.objective import ClosedLoopObjective
 from jaxmpc.tuning.parameters import Parameter, raw
-from jaxmpc.tuning.weights import ClosedLoopObjective, tune_weights
+from jaxmpc.tuning.weights import tune_weights
 
 
 @dataclass(frozen=True)

@@ -233,6 +233,7 @@ def test_starts_are_feasible_and_others_counted():
         ("weights --tune tightening --terminal invariant", "--tune tightening"),
         ("weights --tune tightening --margin 0.6", "--margin: 0.6"),
         ("weights --optimizer chain", "'chain' is no optimizer"),
+        ("weights --mode gauss-newton --learning-rate 0.1", "--mode: gauss-newton with an opt"),
         ("weights --optimizer lbfgs", "'lbfgs' is no optimizer"),
         ("weights --learning-rate 0", "--learning-rate: 0"),
         ("weights --tracking 1", "--tracking: has 1 numbers. The problem needs 2"),

@@ -14,8 +14,9 @@ from jaxmpc.closed_loop.simulation import Run
 from jaxmpc.tuning import weights
 from jaxmpc.tuning.descent import Settings
 from jaxmpc.tuning.losses import ClosedLoopLoss
+from jaxmpc.tuning.objective import ClosedLoopObjective, operations
 from jaxmpc.tuning.parameters import Parameter
-from jaxmpc.tuning.weights import operations, tune_weights
+from jaxmpc.tuning.weights import tune_weights
 
 SYSTEM = jm.LinearSystem(np.array([[1.0, 0.2], [0.0, 1.0]]), np.array([[0.02], [0.2]]), dt=0.2)
 LIMITS = symmetric(1.0, 0.6)
@@ -382,7 +383,7 @@ def test_loops_have_the_conditions_of_simulate(x64):
     """A delay, a disturbance and noise: the losses are those of `simulate_many` under the same."""
     x0s, start = starts(6), {k: v.value for k, v in PARAMETERS.items()}
     conditions = {"delay": 1, "noise": NOISE, "disturbance": np.tile([0.0, 0.01], (8, 1))}
-    objective = weights.ClosedLoopObjective(
+    objective = ClosedLoopObjective(
         lambda v: jm.Controller(weighed(v), SOLVER), PARAMETERS, SYSTEM, 8, LOSS, None, None, None,
         conditions,
     )  # fmt: skip
@@ -403,7 +404,7 @@ def test_an_observer_is_tuned_through_the_loop(x64):
         return jm.closed_loop.KalmanFilter(SYSTEM, v["process"], 0.03, np.array([[1.0, 0.0]]))
 
     parameters = {"process": Parameter(0.02, "positive")}
-    objective = weights.ClosedLoopObjective(
+    objective = ClosedLoopObjective(
         lambda v: jm.Controller(MPC, SOLVER), parameters, SYSTEM, 8, LOSS, None, None, None,
         {"observer": observer, "noise": noise},
     )  # fmt: skip

@@ -53,6 +53,8 @@ FILES = ("tuning.json", TUNED, "tuning.png", "before_after.png", "maps.png")
 # Weight of the time to settle, in time steps, for a linear problem: without it the loss is about
 # the cost that the controller minimises anyway, and nothing can be gained.
 SETTLING = 5.0
+# The optimizer where none is given, and its learning rate.
+ADAM, RATE = "adam", 0.05
 # Entries of a weight that the table shows.
 SHOWN = 24
 # Numbers of the table: name in `WeightTask.counts`, name in the table, what they are fractions of.
@@ -77,7 +79,9 @@ class TuneWeights(TuneWeightsOptions):
         begun, compiled = time.perf_counter(), Compiled.seconds
         self.check()
         check_results(self.output / FILES[0], self.resume, self.overwrite)
-        optimizer = optimizer_of(self.optimizer, self.learning_rate)
+        optimizer = None
+        if self.mode != "gauss-newton":
+            optimizer = optimizer_of(self.optimizer or ADAM, self.learning_rate or RATE)
         problem = problem_of_file(self) if self.robot is None else problem_of_robot(self)
         task, options = problem.task, self.record(problem)
         folder = run_folder(self.output, FILES, options, self.resume, self.overwrite)
@@ -110,6 +114,8 @@ class TuneWeights(TuneWeightsOptions):
         return as_json(
             {
                 **found,
+                "optimizer": self.optimizer or ADAM,
+                "learning_rate": self.learning_rate or RATE,
                 "steps": task.steps,
                 "dtype": task.dtype,
                 "iterations": task.solver.iterations,
@@ -129,6 +135,9 @@ class TuneWeights(TuneWeightsOptions):
             refuse(given, self.robot, "Starts are drawn by --spread, and no terminal set is used")
         if not self.tune or len(set(self.tune)) != len(self.tune):
             fail("--tune", f"{' '.join(self.tune) or 'nothing'}", "Name each quantity once")
+        if self.mode == "gauss-newton" and (self.optimizer or self.learning_rate):
+            cure = "Leave --optimizer and --learning-rate out: it has steps of its own"
+            fail("--mode", "gauss-newton with an optimizer", cure)
         if self.steps is not None and self.seconds is not None:
             fail("--seconds", "given beside --steps", "Give one of them")
 

@@ -121,17 +121,18 @@ class TuneWeightsOptions:
     """Length of the closed loops in time steps."""
     seconds: Annotated[float | None, option("S", "none: --steps"), POSITIVE] = None
     """Length of the closed loops in seconds."""
-    optimizer: Annotated[str, option("NAME", "adam")] = "adam"
+    optimizer: Annotated[str | None, option("NAME", "adam; gauss-newton none")] = None
     """Optimizer of optax, by name: adam, adamw, sgd, rmsprop, lion, ..."""
-    learning_rate: Annotated[float, option("X", "0.05"), POSITIVE] = 0.05
+    learning_rate: Annotated[float | None, option("X", "0.05"), POSITIVE] = None
     """Learning rate; with adam a weight changes by about this fraction in a step."""
     mode: Annotated[
-        Literal["auto", "forward", "reverse"],
+        Literal["auto", "forward", "reverse", "sampling", "gauss-newton"],
         option(
-            "{auto,forward,reverse}",
+            "{auto,forward,reverse,sampling,gauss-newton}",
             "auto",
             "Differentiation: the time of forward grows with the number of weights, the memory of "
-            "reverse with the length of the loops. auto: the one with fewer operations.",
+            "reverse with the length of the loops. auto: the one with fewer operations. sampling: "
+            "from simulations alone, for contacts. gauss-newton: steps of its own, few of them.",
         ),
     ] = "auto"
     tracking: Annotated[tuple[float, ...] | None, option("Q [Q ...]", "Q at the start")] = None
