@@ -89,9 +89,15 @@ def holds_robots(after, said):
 
 
 def holds_tuning(after, said):
-    """The loss on states set apart falls, and the penalties learned solve them."""
-    assert after[-1]["run"].improvement > 0.01
+    """The loss on states set apart falls, without derivatives too, and the penalties learned solve
+    them; the front is monotone, and the longer horizon goes on where the shorter one ended."""
+    assert after[1]["run"].improvement > 0.01
     assert after[-1]["solver"].rho.shape[0] == 4
+    assert after[3]["rough"].improvement > 0.5
+    losses = after[4]["trade"].losses
+    assert np.all(np.diff(losses[:, 0]) > 0) and np.all(np.diff(losses[:, 1]) < 0)
+    assert len(after[5]["run"].starts) == 3
+    assert after[6]["run"].before["loss"] < 0.5 * after[5]["run"].before["loss"]
 
 
 def holds_learning(after, said):

@@ -1,7 +1,8 @@
-"""Tuning by gradient descent, with a checkpoint after each step.
+"""Tuning by gradient descent or by samples, with a checkpoint after each step.
 
 tune_weights                              fields of an MPC, through its closed loops -> TuningRun
                                           with Settings and the steps of a Descent
+trade_off                                 several losses at once -> TradeOff
 linear_task, robot_task                   what `jaxmpc tune weights` tunes: loops, loss, weights
                                           -> WeightTask, with a loss as weight_loss makes it
 weight_parameters, feasible_states        its parameters, and initial states that have a plan
@@ -20,6 +21,7 @@ from jaxmpc.tuning.feasible_set import tune_feasible_set
 from jaxmpc.tuning.layer import MPCLayer
 from jaxmpc.tuning.losses import ClosedLoopLoss
 from jaxmpc.tuning.parameters import Parameter
+from jaxmpc.tuning.pareto import TradeOff, trade_off
 from jaxmpc.tuning.result import Interrupted, TuningRun, run_folder
 from jaxmpc.tuning.solver import transfer_penalties, tune_solver
 from jaxmpc.tuning.tasks import (
@@ -39,12 +41,14 @@ __all__ = [
     "MPCLayer",
     "Parameter",
     "Settings",
+    "TradeOff",
     "TuningRun",
     "WeightTask",
     "feasible_states",
     "linear_task",
     "robot_task",
     "run_folder",
+    "trade_off",
     "transfer_penalties",
     "tune_feasible_set",
     "tune_solver",

@@ -1,5 +1,6 @@
-"""ClosedLoopLoss: the cost of a closed loop, as a differentiable number."""
+"""ClosedLoopLoss: the cost of a closed loop, as a differentiable number; several losses at once."""
 
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -16,6 +17,8 @@ from jaxmpc.sets.limits import row_violations
 
 # Names of the terms, in the order in which they are told.
 TERMS = ("tracking", "effort", "violation", "settling")
+# Before the name of each of several losses, among the numbers of a run.
+TERM = "loss "
 
 
 @record
@@ -116,3 +119,18 @@ class ClosedLoopLoss:
         if reference.ndim == 2 and len(reference) < length:
             reference = jnp.concatenate([reference, reference[-1:]])
         return reference[:length] if reference.ndim == 2 else reference
+
+
+@record
+class SeveralLosses:
+    """Several losses of one run, by name, as a function of it with L numbers."""
+
+    functions: Mapping[str, Callable[[Run], Any]]
+
+    def __call__(self, run: Run) -> Array:
+        """Return the losses (L,) of one run."""
+        found = {name: jnp.asarray(function(run)) for name, function in self.functions.items()}
+        for name, value in found.items():
+            if value.shape != ():
+                fail(f"losses[{name!r}]", f"has shape {value.shape}", "Return one number")
+        return jnp.stack(list(found.values()))

@@ -30,7 +30,7 @@ from jaxmpc.qp.linalg import arrays
 from jaxmpc.qp.status import Status
 from jaxmpc.sets.limits import TOLERANCE
 from jaxmpc.tuning.batch_mean import BatchMean
-from jaxmpc.tuning.losses import ClosedLoopLoss
+from jaxmpc.tuning.losses import TERM, ClosedLoopLoss, SeveralLosses
 from jaxmpc.tuning.parameters import Parameters, values
 
 MODES = ("auto", "forward", "reverse", "sampling", "gauss-newton")
@@ -45,6 +45,8 @@ FACTORING = ("cholesky", "triangular_solve", "lu", "eigh", "qr", "householder_pr
 
 # Name, beside the variations of the plants, of the numbers of the loops, by which noise is drawn.
 LOOP = "number of the loop"
+# Name there of the weights (L,) of `SeveralLosses`.
+MIX = "weights of the losses"
 
 # Initial states (B, n), and the variations of the plant with B in front.
 Data = tuple[np.ndarray, dict[str, np.ndarray]]
@@ -91,7 +93,7 @@ class ClosedLoopObjective:
         numbers: Any = None
         if shared.get("noise") is not None:
             numbers = varied.get(LOOP, np.arange(len(x0s)))
-        varied = {name: v for name, v in varied.items() if name != LOOP}
+        varied = {name: v for name, v in varied.items() if name not in (LOOP, MIX)}
         each = Each(x0s.astype(controller.dtype), varied, {}, numbers)
         run = simulate_each(
             controller, plant, Conditions(**shared), each, steps=self.steps, checkpoint=checkpoint
@@ -101,10 +103,13 @@ class ClosedLoopObjective:
             design = jnp.asarray(self.design_loss(controller.mpc))
         return run, design
 
-    def mean(self, run: Run, weights: Array) -> tuple[Array, Array]:
-        """Return the weighted mean loss of loops (B, …), and the loss of each (B,)."""
-        losses = jax.vmap(self.loss)(run)
-        return jnp.sum(jnp.where(weights > 0, weights * losses, 0.0)) / jnp.sum(weights), losses
+    def losses(self, run: Run, varied: dict[str, Array]) -> tuple[Array, dict[str, Array]]:
+        """Return the loss of each of the loops (B, …), and of several losses each."""
+        found = jax.vmap(self.loss)(run)
+        if not isinstance(self.loss, SeveralLosses):
+            return found, {}
+        terms = {f"{TERM}{name}": found[:, i] for i, name in enumerate(self.loss.functions)}
+        return jnp.sum(varied[MIX] * found, axis=1), terms
 
     def total(
         self,
@@ -117,8 +122,8 @@ class ClosedLoopObjective:
     ) -> tuple[Array, dict[str, Array]]:
         """Return the weighted mean loss, and the recorded numbers of each loop."""
         run, design = self.loops(theta, plant, x0s, varied, checkpoint)
-        total, losses = self.mean(run, weights)
-        return total + design, self.numbers(run, losses, design)
+        losses, terms = self.losses(run, varied)
+        return mean(losses, weights) + design, self.numbers(run, losses, design) | terms
 
     def numbers(self, run: Run, losses: Array, design: Array) -> dict[str, Array]:
         """Return the recorded numbers of each loop, and the design loss."""
@@ -272,22 +277,28 @@ class ClosedLoopObjective:
         unravel = ravel_pytree(arrays(theta))[1]
 
         def curved(theta: Any, *rest: Any) -> tuple[Array, Any, dict[str, Array]]:
-            flat, weights = ravel_pytree(theta)[0], rest[-1]
+            flat, (*_, varied, weights) = ravel_pytree(theta)[0], rest
 
             def at(flat: Array) -> tuple[Any, Any]:
                 run, design = self.loops(unravel(flat), *rest[:-1])
-                total, losses = self.mean(run, weights)
-                return (total + design, run.states, run.inputs), (run, losses, design)
+                losses, terms = self.losses(run, varied)
+                total = mean(losses, weights) + design
+                numbers = self.numbers(run, losses, design) | terms
+                return (total, run.states, run.inputs), (run, numbers)
 
             one = lambda v: jax.jvp(at, (flat,), (v,), has_aux=True)
-            (value, *path), (gradient, *moves), (run, losses, design) = jax.vmap(
+            (value, *path), (gradient, *moves), (run, numbers) = jax.vmap(
                 one, out_axes=(None, 0, None)
             )(jnp.eye(len(flat), dtype=flat.dtype))
-            loss = lambda path: self.mean(replace(run, states=path[0], inputs=path[1]), weights)[0]
+
+            def loss(path: Any) -> Array:
+                moved = replace(run, states=path[0], inputs=path[1])
+                return mean(self.losses(moved, varied)[0], weights)
+
             bend = lambda move: jax.jvp(jax.grad(loss), (path,), (move,))[1]
             both = zip(moves, jax.vmap(bend)(moves), strict=True)
             curvature = sum(jnp.einsum("i...,j...->ij", move, bent) for move, bent in both)
-            return value, (gradient, curvature), self.numbers(run, losses, design)
+            return value, (gradient, curvature), numbers
 
         program = self.over(curved, devices)
         evaluate = self.several(devices)
@@ -305,6 +316,11 @@ class ClosedLoopObjective:
             return value, back(-steps[best] * (totals[best] < value)), aux
 
         return slope
+
+
+def mean(losses: Array, weights: Array) -> Array:
+    """Return the mean of losses (B,) with weights; one of weight zero may be anything."""
+    return jnp.sum(jnp.where(weights > 0, weights * losses, 0.0)) / jnp.sum(weights)
 
 
 def flattened(theta: Any) -> tuple[np.ndarray, Callable]:
@@ -382,6 +398,7 @@ def controller_of(make_mpc: Any, given: Mapping[str, Any], solver: ADMM) -> Any:
 def means(aux: dict[str, np.ndarray], weights: np.ndarray) -> dict[str, float]:
     """Return the means over the loops that have a weight, as `tune_weights` documents them."""
     used = np.asarray(weights) > 0
-    names = ("unsolved", "infeasible", "fallback", "violation")
+    terms = [name for name in aux if name.startswith(TERM)]
+    names = ("unsolved", "infeasible", "fallback", "violation", *terms)
     found = {name: float(np.mean(aux[name][used])) if used.any() else np.nan for name in names}
     return {**found, "excluded": float(np.sum(~used))}

@@ -14,6 +14,7 @@ leading axis: one for each step, each in the domain.
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -156,6 +157,11 @@ def require_parameters(parameters: Parameters) -> None:
             fail(f"parameters[{name!r}]", f"is a {kind}", "Wrap it in a jm.Parameter")
     if not any(parameter.train.any() for parameter in parameters.values()):
         fail("parameters", "none is trained", "Set train=True for what is to move")
+
+
+def moved(parameters: Parameters, to: Mapping[str, Any]) -> dict[str, Parameter]:
+    """Return the parameters with the values that are given, and else their own."""
+    return {name: replace(p, value=to.get(name, p.value)) for name, p in parameters.items()}
 
 
 def raw(parameters: Parameters) -> dict[str, np.ndarray]:

@@ -43,6 +43,8 @@ class TuningRun:
     build: values → the tuned object (controller, MPC, ADMM or penalties).
     history: record of every step (`Descent`); None where the run comes from a cache.
     trace: name → values at every step (T + 1, …); empty where the run comes from a cache.
+    start: number of the starting point of which it is the run, 0 for the given values. starts (S,):
+        least validation loss from each of several, NaN where it was not finite; None for one.
     """
 
     values: dict[str, np.ndarray]
@@ -54,6 +56,8 @@ class TuningRun:
     build: Callable[[Mapping[str, Any]], Any]
     history: Any = field(default=None, repr=False)
     trace: Mapping[str, np.ndarray] = field(default_factory=dict, repr=False)
+    start: int = 0
+    starts: np.ndarray | None = None
 
     @classmethod
     def of_parameters(
@@ -92,6 +96,8 @@ class TuningRun:
         number, best = "{:.6g}".format, ""
         if self.history is not None:
             best = f", best of {self.history.steps} steps at step {self.history.best}"
+        if self.starts is not None:
+            best += f" from start {self.start} of {len(self.starts)}"
         words = f"{self.improvement:.1%} less" if self.improved else "no step is better"
         loss = number(self.before["loss"]), number(self.after["loss"])
         rows = [("loss", *loss, f"{words}{best}")]
@@ -146,6 +152,8 @@ class TuningRun:
             "before": self.before,
             "after": self.after,
         }
+        if self.starts is not None:
+            found |= {"start": self.start, "starts": column(self.starts)}
         h = self.history
         if h is None:
             return found
@@ -178,12 +186,15 @@ def _few(value: np.ndarray) -> str:
 class Interrupted(KeyboardInterrupt):
     """Raised by a tuner that an interrupt (Ctrl-C) ends after its first step.
 
-    run: the `TuningRun` of the steps that were done, with the best of them as its result. As a
-    KeyboardInterrupt it ends a program that does not catch it.
+    run: the `TuningRun` of the steps that were done, with the best of them as its result; of
+    `trade_off` the `TradeOff` of the points that were begun. done: what was done, for the message;
+    None: the steps of the run. As a KeyboardInterrupt it ends a
+    program that does not catch it.
     """
 
-    def __init__(self, run: TuningRun) -> None:
-        super().__init__(f"stopped after {run.history.steps} steps; the best of them: .run")
+    def __init__(self, run: Any, done: str | None = None) -> None:
+        done = done or f"{run.history.steps} steps"
+        super().__init__(f"stopped after {done}; the best of them: .run")
         self.run = run
 
 

@@ -1,8 +1,9 @@
 """tune_weights: tune parameters of an MPC problem by gradients through its closed loops."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -17,9 +18,10 @@ from jaxmpc.mpc.problem import MPC, harden
 from jaxmpc.mpc.stagewise.nonlinear import as_argument
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.tuning.descent import Settings, descend
-from jaxmpc.tuning.losses import ClosedLoopLoss
+from jaxmpc.tuning.losses import ClosedLoopLoss, SeveralLosses
 from jaxmpc.tuning.objective import (
     LOOP,
+    MIX,
     MODES,
     ClosedLoopObjective,
     Data,
@@ -27,8 +29,14 @@ from jaxmpc.tuning.objective import (
     controller_of,
     means,
 )
-from jaxmpc.tuning.parameters import Parameters, raw, require_parameters
-from jaxmpc.tuning.result import TuningRun, finished
+from jaxmpc.tuning.parameters import (
+    Parameters,
+    exact_values,
+    moved,
+    raw,
+    require_parameters,
+)
+from jaxmpc.tuning.result import Interrupted, TuningRun, finished
 
 # Where make_mpc returns a problem and no solver is given.
 SOLVER = ADMM(iterations=50, rho=1.0, alpha=1.6, newton_steps=20)
@@ -49,6 +57,7 @@ def tune_weights(
     solver: ADMM | None = None,
     design_loss: Callable[[MPC], Any] | None = None,
     mode: str = "auto",
+    starts: int | Sequence[Mapping[str, Reals]] = 1,
     **settings: Any,
 ) -> TuningRun:
     """Minimise the mean loss of closed loops over parameters of their MPC, by gradient or samples.
@@ -83,6 +92,11 @@ def tune_weights(
             plants outside JAX (`jax.pure_callback`); numbers are moved by about a tenth of a
             weight. "gauss-newton": steps from first derivatives of the loops and second ones of
             the loss, by forward mode, for few parameters and a smooth loss.
+        starts: number of starting points, or, beside the given values, name → value of each of the
+            others; what is not named starts as given. Of a number the others are random: each θ
+            of `Parameter` is moved by a normal number, a weight by a factor of e or so. All take
+            the same steps through the same programs; the result is the best on the validation
+            loops, and says which it was. Checkpoints of the others: NAME-1.npz, ...
         settings: of `Settings`, as updates=20, batch=64. optimizer None: Adam of 0.05, which
             moves a weight by 5 % a step; with "gauss-newton" its steps themselves. validation:
             given initial states have no variations unless they are a pair of states and
@@ -102,9 +116,47 @@ def tune_weights(
     Raises ValueError for what does not fit together, before any compile, and on Ctrl-C
     `Interrupted`, a KeyboardInterrupt that holds the `TuningRun` of the finished steps.
     """
-    require_parameters(parameters)
     chosen = Settings(**settings)
-    chosen.validate()
+    loops = prepared(
+        make_mpc,
+        parameters,
+        plant,
+        x0s,
+        loss,
+        steps,
+        chosen,
+        reference=reference,
+        input_reference=input_reference,
+        variations=variations,
+        conditions=conditions,
+        solver=solver,
+        design_loss=design_loss,
+        mode=mode,
+    )
+    points = _starting_points(parameters, starts, chosen.seed)
+    return loops.run(parameters) if len(points) == 1 else _best_of(loops, points)
+
+
+def prepared(
+    make_mpc: Callable[[Mapping[str, Any]], Any],
+    parameters: Parameters,
+    plant: Any,
+    x0s: Reals,
+    loss: Callable[[Run], Any] | None,
+    steps: int,
+    settings: Settings,
+    *,
+    reference: Reals | None = None,
+    input_reference: Reals | None = None,
+    variations: Mapping[str, Any] | None = None,
+    conditions: Mapping[str, Any] | None = None,
+    solver: ADMM | None = None,
+    design_loss: Callable[[MPC], Any] | None = None,
+    mode: str = "auto",
+) -> "Loops":
+    """Return the closed loops of `tune_weights`, whose arguments these are, without compiling."""
+    require_parameters(parameters)
+    settings.validate()
     x0s = np.asarray(x0s)
     if x0s.ndim != 2 or not len(x0s):
         fail("x0s", f"shape {x0s.shape}", "Give initial states (B, n)")
@@ -116,9 +168,8 @@ def tune_weights(
     require_conditions(conditions)
     if conditions.get("noise") is not None:
         variations[LOOP] = np.arange(len(x0s))
-    train, test = chosen.split((x0s, variations))
+    train, test = settings.split((x0s, variations))
     require_variations(plant, {k: v for k, v in test[1].items() if k != LOOP}, len(test[0]))
-    start = raw(parameters)
     initial = {name: np.asarray(p.value) for name, p in parameters.items()}
     build = partial(controller_of, make_mpc, solver=SOLVER if solver is None else solver)
     try:
@@ -133,14 +184,59 @@ def tune_weights(
         loss = _default_loss(controller, plant, *aims)
     given = as_argument(plant), steps, loss, reference, input_reference, design_loss, conditions
     objective = ClosedLoopObjective(build, parameters, *given)
-    objective.check(start, train)
-    decides = chosen.decides(parameters, train, test)
-    decides |= {"steps": steps, "dtype": np.dtype(controller.dtype).name}
-    loops = _Loops(objective, chosen, start, train, test, mode)
-    optimizer = optax.sgd(1.0) if mode == "gauss-newton" else optax.adam(0.05)
-    history = descend(start, loops.gradient, loops.validate, optimizer, chosen, decides)
-    decides["mode"] = loops.mode
-    return finished(TuningRun.of_parameters(parameters, history, decides, build))
+    loops = Loops(objective, settings, train, test, mode, np.dtype(controller.dtype).name)
+    if isinstance(loss, SeveralLosses):
+        loops.weigh(np.ones(len(loss.functions)))
+    objective.check(raw(parameters), loops.train)
+    return loops
+
+
+def _starting_points(
+    parameters: Parameters, starts: int | Sequence[Mapping[str, Reals]], seed: int
+) -> list[Parameters]:
+    """Return the parameters at each starting point, the given one first."""
+    if isinstance(starts, Sequence) and not isinstance(starts, str):
+        for given in starts:
+            for name in given if isinstance(given, Mapping) else [str(given)]:
+                if name not in parameters:
+                    cure = f"{nearest(str(name), parameters)}Give values of {', '.join(parameters)}"
+                    fail("starts", f"holds {name!r}, which is no parameter", cure)
+        return [parameters, *(moved(parameters, given) for given in starts)]
+    random, theta = np.random.default_rng(seed), raw(parameters)
+    draw = lambda: {name: v + random.normal(size=v.shape) for name, v in theta.items()}
+    others = range(whole("starts", starts, 1) - 1)
+    return [parameters, *(moved(parameters, exact_values(parameters, draw())) for _ in others)]
+
+
+def _best_of(loops: "Loops", points: Sequence[Parameters]) -> TuningRun:
+    """Return the run of the starting point that comes to the least validation loss, beside what
+    the loss is at the first one. Raises Interrupted."""
+    runs: dict[int, TuningRun] = {}
+    stopped = False
+    try:
+        for number, parameters in enumerate(points):
+            # The given point raises an error where its loss is not finite; another is left out.
+            if number == 0 or np.isfinite(loops.validate(raw(parameters))[0]):
+                runs[number] = loops.run(parameters, number)
+    except KeyboardInterrupt as stop:
+        if isinstance(stop, Interrupted):
+            runs[number] = stop.run
+        if not runs:
+            raise
+        stopped = True
+    first, best = runs[0], min(runs, key=lambda number: runs[number].after["loss"])
+    after = [runs[i].after["loss"] if i in runs else np.nan for i in range(len(points))]
+    found = replace(
+        runs[best],
+        initial=first.initial,
+        before=first.before,
+        improved=best > 0 or first.improved,
+        start=best,
+        starts=np.array(after),
+    )
+    if stopped:
+        raise Interrupted(found, f"{len(runs)} of {len(points)} starts")
+    return found
 
 
 def require_conditions(conditions: Mapping[str, Any]) -> None:
@@ -154,25 +250,48 @@ def require_conditions(conditions: Mapping[str, Any]) -> None:
 
 
 @dataclass(eq=False)
-class _Loops:
-    """The closed loops of a descent from `start`, those of its steps and those of validation.
+class Loops:
+    """The closed loops of a tuner, those of its steps and those of validation; its programs, which
+    all its descents share.
 
-    mode: as given, from the first step on the one that is used; slope: its program. finite: of the
-    validation loops, those that are finite at the start.
+    mode: as given, from the first step on the one that is used; slope: its program. dtype: of the
+    numbers. finite: of the validation loops, those that are finite at the first point.
     """
 
     objective: ClosedLoopObjective
     settings: Settings
-    start: dict[str, np.ndarray]
     train: Data
     test: Data
     mode: str
+    dtype: str
     slope: Slope | None = None
     finite: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         self.devices = chosen_devices(self.settings.devices)
         self.evaluate = self.objective.evaluation(self.devices)
+
+    def weigh(self, weights: np.ndarray) -> None:
+        """Set the weights (L,) of several losses."""
+        for x, varied in (self.train, self.test):
+            varied[MIX] = np.tile(weights, (len(x), 1))
+
+    def run(self, parameters: Parameters, number: int = 0) -> TuningRun:
+        """Return the run that starts with the values of these parameters.
+
+        number: of several runs, by which their checkpoints differ. Raises Interrupted.
+        """
+        settings, objective = self.settings, self.objective
+        if number and settings.checkpoint is not None:
+            path = Path(settings.checkpoint)
+            settings = replace(settings, checkpoint=path.with_stem(f"{path.stem}-{number}"))
+        decides = settings.decides(parameters, self.train, self.test)
+        decides |= {"steps": objective.steps, "dtype": self.dtype}
+        optimizer = optax.sgd(1.0) if self.mode == "gauss-newton" else optax.adam(0.05)
+        start = raw(parameters)
+        history = descend(start, self.gradient, self.validate, optimizer, settings, decides)
+        decides["mode"] = self.mode
+        return finished(TuningRun.of_parameters(parameters, history, decides, objective.build))
 
     def of_step(self, step: int) -> Data:
         """Return the initial states and variations of a step."""
@@ -183,7 +302,7 @@ class _Loops:
         """Return loss, gradient and numbers of a step; without the loops that are not finite."""
         x, varied = self.of_step(step)
         if self.slope is None:
-            chosen = self.start, self.of_step(0), self.mode, self.devices
+            chosen = theta, self.of_step(0), self.mode, self.devices
             self.mode, self.slope = self.objective.slope(*chosen)
         weights, seed = np.ones(len(x)), [self.settings.seed, step]
         value, slopes, aux = self.slope(theta, x, varied, weights, seed)

@@ -13,7 +13,7 @@ from panels import require_no_empty_panel
 from jaxmpc.app.plots import plot_body, plot_feasible_set, plot_recursion, plot_robot_map
 from jaxmpc.app.plots.closed_loops import plot_before_after, plot_runs
 from jaxmpc.app.plots.style import FEASIBLE, INFEASIBLE
-from jaxmpc.app.plots.tuning import plot_maps, plot_solver, plot_tuning
+from jaxmpc.app.plots.tuning import plot_maps, plot_solver, plot_trade_off, plot_tuning
 from jaxmpc.closed_loop.simulation import Run
 from jaxmpc.recursion.counterexamples import Counterexample, SampledLoops
 from jaxmpc.recursion.proofs import Claim
@@ -22,6 +22,7 @@ from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.sets.convex_sets import Box, Polytope
 from jaxmpc.systems.system import LinearSystem
 from jaxmpc.tuning.descent import Descent
+from jaxmpc.tuning.pareto import TradeOff
 
 
 @dataclasses.dataclass(frozen=True)
@@ -378,3 +379,14 @@ def test_an_empty_panel_is_found():
         require_no_empty_panel(figure)
     ax.plot([0.0], [0.0], "o")
     require_no_empty_panel(figure)
+
+
+def test_a_trade_off_shows_the_front_dominated_points_and_the_start():
+    losses = np.array([[3.0, 1.0], [1.0, 4.0], [2.5, 3.0], [2.0, 2.0]])
+    weights = np.array([[1.0, 20.0], [5.0, 2.0], [1.0, 0.0], [1.0, 2.0]])
+    ax = plot_trade_off(TradeOff(("far", "loud"), weights, losses, np.array([4.0, 2.0]), ()))
+    lines = {line.get_label(): line.get_xydata().tolist() for line in ax.lines}
+    assert lines["Pareto optimal"] == [[1.0, 4.0], [2.0, 2.0], [3.0, 1.0]]
+    assert lines["dominated"] == [[2.5, 3.0]] and lines["as given"] == [[4.0, 2.0]]
+    assert [text.get_text() for text in ax.texts] == ["5:1", "1:1", "1:10"]
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("loss: far", "loss: loud")

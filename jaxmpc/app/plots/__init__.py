@@ -8,6 +8,7 @@ plot_runs           closed loops over time with their limits
 plot_before_after   the same loops before and after tuning
 plot_regions        the explicit law of two parameters: regions, law or value
 plot_tuning         losses, gradients and weights of a descent
+plot_trade_off      two losses against each other, and the front
 plot_maps           feasible sets before and after tuning
 plot_solver         penalties of a tuned solver, and residuals
 """
@@ -15,7 +16,7 @@ plot_solver         penalties of a tuned solver, and residuals
 from jaxmpc.app.plots.closed_loops import plot_before_after, plot_runs
 from jaxmpc.app.plots.laws import plot_regions
 from jaxmpc.app.plots.maps import plot_body, plot_feasible_set, plot_recursion, plot_robot_map
-from jaxmpc.app.plots.tuning import plot_maps, plot_solver, plot_tuning
+from jaxmpc.app.plots.tuning import plot_maps, plot_solver, plot_trade_off, plot_tuning
 
 __all__ = [
     "plot_before_after",
@@ -27,5 +28,6 @@ __all__ = [
     "plot_robot_map",
     "plot_runs",
     "plot_solver",
+    "plot_trade_off",
     "plot_tuning",
 ]

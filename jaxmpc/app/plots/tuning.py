@@ -14,6 +14,7 @@ from jaxmpc.app.plots.maps import ring
 from jaxmpc.app.plots.style import AFTER, BEFORE, EDGE, GRID
 from jaxmpc.feasible.map import FeasibleSetMap
 from jaxmpc.tuning.descent import Descent
+from jaxmpc.tuning.pareto import TradeOff
 from jaxmpc.tuning.result import TuningRun
 
 REJECTED, BEST = "#a50f15", "#006f52"
@@ -181,6 +182,45 @@ def _draw_weights(
     ax.legend(
         handles=handles, fontsize=8, frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.02)
     )
+
+
+def plot_trade_off(trade: TradeOff, ax: Axes | None = None) -> Axes:
+    """Draw the first two losses of a trade-off against each other.
+
+    trade: of `trade_off`. ax: axes to draw into; None: new ones. The Pareto optimal points are
+    joined by a line, with the ratio of their weights in shares of the losses at the start; points
+    that another one dominates are empty, the given values a cross.
+    """
+    if ax is None:
+        ax = Figure(figsize=(5.6, 4.2), layout="constrained").add_subplot()
+    (x, y), front = trade.losses[:, :2].T, trade.efficient
+    order = np.flatnonzero(front)[np.argsort(x[front])]
+    ax.plot(x[order], y[order], "o-", color=AFTER, ms=6, lw=1.2, label="Pareto optimal")
+    if not front.all():
+        ax.plot(x[~front], y[~front], "o", color=AFTER, mfc="none", ms=6, label="dominated")
+    ax.plot(*trade.initial[:2], "x", color=BEFORE, ms=8, mew=2, label="as given")
+    shares = trade.weights[:, :2] * trade.initial[:2]
+    for k in order if len(order) <= 2 * NAMED else ():
+        ax.annotate(
+            _ratio(*shares[k]), (x[k], y[k]), (6, 6), textcoords="offset points", fontsize=8
+        )
+    ax.set_xlabel(f"loss: {trade.names[0]}")
+    ax.set_ylabel(f"loss: {trade.names[1]}")
+    ax.grid(**GRID)
+    ax.set_axisbelow(True)
+    ax.margins(0.12)
+    ax.legend(fontsize=8, frameon=False)
+    title = f"Trade-off, weights {trade.names[0]} : {trade.names[1]}, validation set"
+    ax.set_title(title, loc="left", fontsize=10)
+    return ax
+
+
+def _ratio(first: float, second: float) -> str:
+    """Return a ratio of weights, with 1 for the smaller one."""
+    least = min(first, second)
+    if least <= 0:
+        return f"{int(first > 0)}:{int(second > 0)}"
+    return f"{first / least:.3g}:{second / least:.3g}"
 
 
 def plot_maps(before: FeasibleSetMap, after: FeasibleSetMap) -> Figure:
