@@ -478,4 +478,7 @@ def _implicit_jvp(conditions_of: Conditions, primals: tuple, tangents: tuple) ->
 
     # Going backward, all but these arguments is computed then: kept, it would be several times as
     # much memory for each solve of a closed loop.
-    return (z, y), jax.checkpoint(moved)(data, constants, z, y, tangents[0])
+    dz, dy = jax.checkpoint(moved)(data, constants, z, y, tangents[0])
+    # Without rows y is the same for a whole batch, and so must its change be: `vmap` of this rule
+    # takes the axes of both from one of them.
+    return (z, y), (dz, dy if y.size else jnp.zeros_like(y))

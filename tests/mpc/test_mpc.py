@@ -574,6 +574,16 @@ def test_bad_reference_raises(reference):
         jm.solve(problems.lecture(), np.zeros(2), reference=reference)
 
 
+def test_derivatives_of_a_batch_of_plans_without_limits():
+    """u = r/2 is the least of |x − r|² + |u|² + |u − r|² where x⁺ = u: for each of many states."""
+    system = jm.LinearSystem(np.zeros((2, 2)), np.eye(2), dt=1.0)
+    controller = jm.Controller(jm.MPC(system, np.eye(2), np.eye(2), 1, terminal_cost=np.eye(2)))
+    inputs = lambda r: jax.vmap(lambda x: controller(x, reference=r).u)(jnp.ones((3, 2)))
+    for derivative in (jax.jacfwd, jax.jacrev):
+        found = jax.jit(derivative(inputs))(jnp.array([1.0, -2.0]))
+        np.testing.assert_allclose(found, np.tile(np.eye(2) / 2, (3, 1, 1)), atol=1e-5)
+
+
 @pytest.mark.slow
 def test_gradients_are_finite_with_half_open_rows():
     """A polytope's rows have no lower bound: its gradients equal those of the same box."""
