@@ -10,6 +10,7 @@ each step and follows the gradient of mean (u − u*)² + mean (x − x*)² by R
 
     dynamics    A and B unknown, W = I and p known
     cost        W = diag(exp θ) and p = −W r unknown, A and B known; θ starts at 1, r at 0
+    both        A, B, W and p unknown
 
 All begin at the same numbers, see the same data in the same order and compute in float64 unless
 `bits` says else. Printed: the loss by step; the largest relative difference of the loss from
@@ -49,7 +50,7 @@ class Settings:
     batch: int = 128
     limit: float = 0.7
     rate: float = 0.01
-    tasks: tuple[str, ...] = ("dynamics", "cost")
+    tasks: tuple[str, ...] = ("dynamics", "cost", "both")
     rivals: tuple[str, ...] = ("mpc.pytorch", "cvxpylayers")
     bits: tuple[int, ...] = (64, 32)
     newton_steps: int | None = None
@@ -82,8 +83,9 @@ class Learned(NamedTuple):
     times: np.ndarray
 
 
-# θ: {"A": (9,), "B": (9,)} or {"Q": (3,), "R": (3,), "r": (6,)}, the weights as logarithms.
+# θ: {"A": (9,), "B": (9,)}, {"Q": (3,), "R": (3,), "r": (6,)} or both, the weights as logarithms.
 Theta = dict[str, Any]
+LEARNED = {"dynamics": ("A", "B"), "cost": ("Q", "R"), "both": ("A", "B", "Q", "R")}
 
 
 def draw(random: np.random.Generator) -> Expert:
@@ -117,9 +119,9 @@ def lesson(s: Settings, expert: Expert, random: np.random.Generator) -> list[Bat
 
 def with_jaxmpc(s: Settings, expert: Expert, start: Expert, task: str) -> Iterator[Any]:
     """Yield after the set-up, then the loss of each batch sent, having stepped."""
-    known = start if task == "dynamics" else expert
-    learn = ("A", "B") if task == "dynamics" else ("Q", "R")
-    weight = 1.0 if task == "dynamics" else float(np.exp(1))
+    learn = LEARNED[task]
+    known = start if "A" in learn else expert
+    weight = float(np.exp(1)) if "Q" in learn else 1.0
     solver = jm.ADMM(newton_steps=s.newton_steps)
     layer = jm.tuning.MPCLayer(problem(known.A, known.B, weight, s.limit), learn, solver)
 
@@ -140,7 +142,7 @@ def with_jaxmpc(s: Settings, expert: Expert, start: Expert, task: str) -> Iterat
         change, state = rule.update(slope, state)
         return optax.apply_updates(theta, change), state, value
 
-    theta = layer.init() | ({} if task == "dynamics" else {"r": jnp.zeros(2 * SIZE)})
+    theta = layer.init() | ({"r": jnp.zeros(2 * SIZE)} if "Q" in learn else {})
     state, value = rule.init(theta), None
     while True:
         batch = yield value
@@ -178,21 +180,22 @@ def cvxpylayers(s: Settings, expert: Expert, task: str) -> Callable:
     X, U = cp.Variable((STEPS_OF_PLAN, SIZE)), cp.Variable((STEPS_OF_PLAN, SIZE))
     x_0, root, aim = cp.Parameter(SIZE), cp.Parameter(2 * SIZE), cp.Parameter(2 * SIZE)
     A, B = cp.Parameter((SIZE, SIZE)), cp.Parameter((SIZE, SIZE))
-    dynamics = task == "dynamics"
-    model = (A, B) if dynamics else (expert.A, expert.B)
-    W, offset = (np.ones(2 * SIZE), expert.r) if dynamics else (root, aim)
+    learn_model, learn_cost = "A" in LEARNED[task], "Q" in LEARNED[task]
+    model = (A, B) if learn_model else (expert.A, expert.B)
+    W, offset = (root, aim) if learn_cost else (np.ones(2 * SIZE), expert.r)
     rows = [X[0] == x_0, cp.abs(U) <= s.limit]
     rows += [X[k + 1] == model[0] @ X[k] + model[1] @ U[k] for k in range(STEPS_OF_PLAN - 1)]
     cost = sum(
         cp.sum_squares(cp.multiply(W, cp.hstack([X[k], U[k]])) - offset)
         for k in range(STEPS_OF_PLAN)
     )
-    parameters = [A, B, x_0] if dynamics else [root, aim, x_0]
+    parameters = [A, B] * learn_model + [root, aim] * learn_cost + [x_0]
     layer = CvxpyLayer(cp.Problem(cp.Minimize(cost), rows), parameters, [X, U])
 
     def plans(A: Any, B: Any, w: Any, r: Any, x: Any) -> tuple[Any, Any]:
-        given = (A, B) if dynamics else (torch.sqrt(w), torch.sqrt(w) * r)
-        return layer(*given, x, solver_args={"solve_method": "Clarabel"})
+        model = (A, B) if learn_model else ()
+        cost = (torch.sqrt(w), torch.sqrt(w) * r) if learn_cost else ()
+        return layer(*model, *cost, x, solver_args={"solve_method": "Clarabel"})
 
     return plans
 
@@ -209,10 +212,11 @@ def with_torch(
     torch.set_num_threads(s.rival_threads)
     tensor = lambda v: torch.tensor(np.asarray(v), dtype=torch.float64)
     plans = rival(s, expert, task)
-    if task == "dynamics":
-        first = {"A": start.A.ravel(), "B": start.B.ravel()}
-    else:
-        first = {"Q": np.ones(SIZE), "R": np.ones(SIZE), "r": np.zeros(2 * SIZE)}
+    first = {}
+    if "A" in LEARNED[task]:
+        first |= {"A": start.A.ravel(), "B": start.B.ravel()}
+    if "Q" in LEARNED[task]:
+        first |= {"Q": np.ones(SIZE), "R": np.ones(SIZE), "r": np.zeros(2 * SIZE)}
     theta = {name: tensor(v).requires_grad_() for name, v in first.items()}
     rule, value = torch.optim.RMSprop(theta.values(), lr=s.rate, alpha=0.99, eps=1e-8), None
     while True:

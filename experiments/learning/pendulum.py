@@ -156,9 +156,8 @@ def run(s: Settings) -> dict[str, list[float]]:
     plan = jax.jit(lambda theta, x: plans(s, theta, x))
     found = plan(EXPERT, draw(np.random.default_rng(1), 256))
     at = np.mean(np.abs(found.inputs) > TORQUE - 1e-6)
-    print(
-        f"{np.mean(found.solved):.1%} of the expert's plans solved, {at:.0%} of its inputs at a limit"
-    )
+    solved = np.mean(found.solved)
+    print(f"{solved:.1%} of the expert's plans solved, {at:.0%} of its inputs at a limit")
     losses = {}
     for task in s.tasks:
         print(f"\n{task} unknown", flush=True)
