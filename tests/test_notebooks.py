@@ -14,7 +14,7 @@ SOURCES = sorted(FOLDER.glob("[0-9]*.py"))
 
 
 def test_the_course_is_complete():
-    assert [path.stem[:2] for path in SOURCES] == [f"{k:02}" for k in range(10)]
+    assert [path.stem[:2] for path in SOURCES] == [f"{k:02}" for k in range(11)]
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda path: path.stem)
