@@ -266,9 +266,9 @@ axes[0].set_ylabel("velocity (rad/s)")
 fig.tight_layout()
 
 # %% [markdown]
-# Red are the triangles that are undecided. In the first picture they bound, on the right, the states
-# from which that network leads out of $C$. The law of the last network, and how far it is from the
-# teacher's, which stays 0.05 away from the limits of the input:
+# Red are the triangles that are undecided. In the first picture they bound, on the right, the
+# states from which that network leads out of $C$. The law of the last network, and how far it is
+# from the teacher's, which stays 0.05 away from the limits of the input:
 
 # %%
 grid = C_room.sample(4000, seed=2)
