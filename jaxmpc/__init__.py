@@ -16,6 +16,7 @@ Each name is imported when it is first used, so that the command can answer Ctrl
 JAX is loaded.
 """
 
+import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -140,6 +141,11 @@ HOMES = {
     "tuning.weights": "tune_weights",
     "workflow": "design",
 }
+
+if "jax" in sys.modules:
+    # It brings Pallas, whose settings are part of what JAX knows programs by: imported only while a
+    # user's function is traced it would have that function compiled a second time.
+    import_module("jax.extend")
 
 
 def __getattr__(name: str) -> Any:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from jaxmpc.checks import concrete, fail, require_real
+from jaxmpc.checks import concrete, require_real, require_untraced
 
 if TYPE_CHECKING:
     # A number, an array of JAX or NumPy, or lists of these: not a text.
@@ -26,9 +26,7 @@ def host_array(argument: str, value: Any, *, copy: bool = True) -> np.ndarray:
 
     All NumPy code (LPs, qhull, Riccati) calls it, so it computes in float64 in either mode of JAX.
     """
-    if not concrete(value):
-        what = "is traced by JAX, and this computation is not traceable"
-        fail(argument, what, "Call it outside jit, vmap and grad")
+    require_untraced(argument, value)
     require_real(argument, value)
     return np.asarray(value).astype(np.float64, copy=copy)
 

@@ -126,6 +126,14 @@ def concrete(*values: Any) -> bool:
     return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(others))
 
 
+def require_untraced(
+    argument: str, value: Any, cure: str = "Call it outside jit, vmap and grad"
+) -> None:
+    """Raise where any number in `value` is being traced, for computations outside JAX."""
+    if not concrete(value):
+        fail(argument, "is traced by JAX, and this computation is not traceable", cure)
+
+
 def whole(argument: str, value: Any, least: int) -> int:
     """Return the value as an int; raise unless it is a whole number of at least `least`."""
     if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < least:

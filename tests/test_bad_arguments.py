@@ -774,3 +774,35 @@ def test_batches_of_sets_and_their_axes_are_made():
     ).shape == (4,)  # fmt: skip
     last = jax.vmap(lambda p: p, out_axes=-1)(many)
     assert (last.H.shape, last.h.shape) == ((3, 2, 4), (3, 4))
+
+
+OUTSIDE = {
+    "solve_many": lambda mpc: jm.solve_many(mpc, np.zeros((4, 2))),
+    "map": lambda mpc: jm.map_feasible_set(mpc, jm.feasible.grid([-1, -1], [1, 1], 3)),
+    "feasible_polytope": jm.feasible_polytope,
+    "boundary": lambda mpc: jm.feasible.boundary(mpc, 8),
+    "sample": lambda mpc: jm.feasible.sample_feasible_set(mpc, 10),
+    "recursion": jm.recursive_feasibility,
+    "first_step_in": lambda mpc: jm.mpc.first_step_in(mpc, jm.Box([-1, -1], [1, 1])),
+    "regions": jm.explicit.critical_regions,
+    "exact_penalty": jm.explicit.exact_penalty,
+    "export_c": lambda mpc: jm.export.export_c(mpc, "never-written"),
+    "export_jax": lambda mpc: jm.export.export_jax(mpc, "never-written"),
+    "choose_steps": lambda mpc: jm.export.choose_steps(mpc, [-1, -1], [1, 1]),
+    "tune_solver": lambda mpc: jm.tuning.tune_solver(mpc, np.zeros((4, 2))),
+    "simulate_many": lambda mpc: jm.simulate_many(
+        jm.Controller(mpc), jm.LinearPlant(mpc.system, mpc.states, mpc.inputs), np.zeros((4, 2)), 3
+    ),
+}
+
+
+@pytest.mark.parametrize("name", OUTSIDE)
+def test_what_jax_cannot_trace_says_so(name, tmp_path, monkeypatch):
+    """In place of an error from inside JAX about an array of a shape."""
+    monkeypatch.chdir(tmp_path)
+
+    def traced(A):
+        OUTSIDE[name](mpc(system=jm.LinearSystem(A, B, dt=0.01)))
+
+    with pytest.raises(ValueError, match=r"^(mpc|controller|A): is traced by JAX, .* outside jit"):
+        jax.eval_shape(traced, A)

@@ -56,6 +56,25 @@ sys.exit(', '.join({late} & set(sys.modules)))"""
     assert done.stderr.strip() == ""
 
 
+def test_a_function_that_imports_names_is_compiled_once():
+    """The names of a user's jitted function may be used in it first, and imported while it is
+    traced: nothing of that may change what JAX knows the function's program by."""
+    program = """import jax
+import jaxmpc as jm
+import numpy as np
+
+@jax.jit
+def scaled(A):
+    jm.MPC, jm.solve, jm.load_robot, jm.simulate, jm.tune_weights, jm.lqr
+    return jm.Box([-1.0], [1.0]).upper * A
+
+scaled(np.eye(1))
+scaled(np.eye(1))
+assert scaled._cache_size() == 1, scaled._cache_size()"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
 def test_without_mujoco(monkeypatch, tmp_path):
     """The rest works, and a robot names what to install, in the command too."""
     monkeypatch.setitem(sys.modules, "mujoco", None)

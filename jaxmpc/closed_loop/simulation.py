@@ -28,7 +28,7 @@ from jaxmpc.batches import (
     program_bytes,
     work_off,
 )
-from jaxmpc.checks import fail, require_real, whole
+from jaxmpc.checks import fail, require_real, require_untraced, whole
 from jaxmpc.closed_loop.estimation import Belief, KalmanFilter, Noise, model_step
 from jaxmpc.closed_loop.feedback import Feedback, LinearFeedback, Plant, first_row, model_of
 from jaxmpc.mpc.plan import Control, checked_aim, checked_array, reference_shapes
@@ -470,6 +470,9 @@ def simulate_many(
 
     Raises ValueError as `simulate` does.
     """
+    cure = "Call it outside jit, vmap and grad; inside them take jax.vmap of jm.simulate"
+    for argument, value in {"x0s": x0s, "controller": controller, "plant": plant}.items():
+        require_untraced(argument, value, cure)
     require_real("x0s", x0s)
     x0s, variations = np.asarray(x0s), dict(variations or {})
     if x0s.ndim != 2 or not len(x0s):

@@ -14,7 +14,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmpc.arrays import Reals, host_array
-from jaxmpc.checks import fail, number, require_finite, require_kind, require_shape, whole
+from jaxmpc.checks import (
+    fail,
+    number,
+    require_finite,
+    require_kind,
+    require_shape,
+    require_untraced,
+    whole,
+)
 from jaxmpc.export.c_files import GIVE_PROBLEM, CFiles, input_limits, literal
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.plan import Plan, WarmStart
@@ -64,6 +72,7 @@ def export_c(
     """
     solver = ADMM() if solver is None else solver
     require_kind("mpc", mpc, MPC, cure=GIVE_PROBLEM)
+    require_untraced("mpc", mpc)
     require_kind("solver", solver, ADMM)
     files = CFiles.open(folder, name, dtype, tolerance, TOLERANCE, overwrite)
     with jax.enable_x64(True):
@@ -264,6 +273,7 @@ def check_fixed_steps(
     Raises ValueError for an invalid problem, bounds of another shape than (n,) and bad counts.
     """
     require_kind("mpc", mpc, MPC, cure=GIVE_PROBLEM)
+    require_untraced("mpc", mpc)
     require_kind("solver", solver, ADMM)
     mpc.require_constant("closed loops need one system for all time steps", "system")
     whole("plans", plans, 1)

@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxmpc.checks import fail, require_kind, require_package
+from jaxmpc.checks import fail, require_kind, require_package, require_untraced
 from jaxmpc.export.c_files import GIVE_PROBLEM, prepared_paths
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.problem import MPC
@@ -42,6 +42,7 @@ def export_jax(
     """
     require_package("flatbuffers", "export")
     require_kind("mpc", mpc, MPC, cure=GIVE_PROBLEM)
+    require_untraced("mpc", mpc)
     solver, path = ADMM() if solver is None else solver, Path(path)
     require_kind("solver", solver, ADMM)
     if dtype not in ("float64", "float32"):

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmpc.arrays import Reals, host_array
-from jaxmpc.checks import number, require_kind, whole
+from jaxmpc.checks import number, require_kind, require_untraced, whole
 from jaxmpc.export.c_files import GIVE_PROBLEM
 from jaxmpc.export.c_solver import (
     LOOPS,
@@ -67,6 +67,7 @@ def choose_steps(
     ValueError as `check_fixed_steps` does.
     """
     require_kind("mpc", mpc, MPC, cure=GIVE_PROBLEM)
+    require_untraced("mpc", mpc)
     number("share", share, 0.0, "Give a fraction from 0 to 1")
     require_box(mpc, lower, upper)
     whole("plans", plans, 1)

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.linalg import qr
 
 from jaxmpc.arrays import Reals
-from jaxmpc.checks import require_kind
+from jaxmpc.checks import require_kind, require_untraced
 from jaxmpc.feasible import condensed_rows, hard_constraints
 from jaxmpc.feasible.condensed_rows import ConstraintRows, RowPrograms
 from jaxmpc.feasible.hard_constraints import Axes, ExactData, View, make_view
@@ -48,6 +48,7 @@ class FeasibilityProblem:
         Raises ValueError for an ill-posed problem and for a wrong view.
         """
         require_kind("mpc", mpc, MPC)
+        require_untraced("mpc", mpc)
         mpc.validate()
         require_tightened(mpc, "what labels by one sequence of inputs")
         mpc = with_constant_sets(mpc)

@@ -23,7 +23,7 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.arrays import host_array
-from jaxmpc.checks import concrete, require_memory
+from jaxmpc.checks import concrete, require_memory, require_untraced
 from jaxmpc.mpc.problem import MPC, Switch, Weights, dynamics_of, weights_of
 from jaxmpc.mpc.rows import Layout, blocks, bounds_of, layout_of, split, stacked
 from jaxmpc.mpc.stagewise.recursion_kernels import riccati_recursion
@@ -261,7 +261,10 @@ def condensed_bytes(
 
 
 def in_float64(mpc: MPC) -> MPC:
-    """The problem as host arrays in float64, with its gains filled in."""
+    """Return the problem as host arrays in float64, with its gains filled in; raise ValueError
+    where it is traced."""
+    cure = "Call it outside jit, vmap and grad; inside them take jm.solve, and jax.vmap for a batch"
+    require_untraced("mpc", mpc, cure)
     return jax.tree.map(np.float64, filled_in(mpc))
 
 
