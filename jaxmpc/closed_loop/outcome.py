@@ -142,6 +142,7 @@ def summarise_runs(
         "robots": len(outcome.kept),
         "samples": run.inputs.shape[1],
         "control_period": robot.dt,
+        "time_unit": robot.time_unit,
         "success": count(outcome.success),
         "limits_kept": count(outcome.kept),
         "limits_kept_to": TOLERANCE["float64"],
@@ -205,13 +206,14 @@ def _speed(runs: StoredRuns, robot: Robot) -> dict[str, float]:
     if timing.count:
         rate = timing.count * steps / timing.run_seconds
         found["solves_per_second"] = rate
-        found["robot_seconds_per_second"] = rate * robot.dt
-        found["real_time_factor"] = steps * robot.dt / timing.run_seconds
+        if robot.time_unit == "s":
+            found["robot_seconds_per_second"] = rate * robot.dt
+            found["real_time_factor"] = steps * robot.dt / timing.run_seconds
     return found
 
 
 def _outcome_rows(s: dict[str, Any]) -> list[tuple[str, str]]:
-    length = f"{s['samples']:,} samples of {s['control_period']:g} s each"
+    length = f"{s['samples']:,} samples of {s['control_period']:g} {s['time_unit']} each"
     rows = [
         ("robots", f"{s['robots']:>9,}  {length}"),
         ("success", f"{_share(s, 'success')}  limits kept, and at the target at the end"),
@@ -245,7 +247,7 @@ def _plan_rows(s: dict[str, Any]) -> list[tuple[str, str]]:
 
 def _time_rows(s: dict[str, Any]) -> list[tuple[str, str]]:
     rows = [
-        ("settling", _middle(s["settling"], "never", " s")),
+        ("settling", _middle(s["settling"], "never", f" {s['time_unit']}")),
         ("cost", _middle(s["cost"], "not finite", "")),
     ]
     this = s.get("this_run")
@@ -254,10 +256,11 @@ def _time_rows(s: dict[str, Any]) -> list[tuple[str, str]]:
     if this and this["count"]:
         what = "MPC solves" if s["plans"] else "control steps"
         robots, rate = f"{this['count']:,}", f"{this['solves_per_second']:,.0f} {what}/s"
-        speed = f"{this['robot_seconds_per_second']:,.4g} robot-seconds/s"
-        factor = f"{this['real_time_factor']:.3g} times real time"
         rows.append(("run", f"{this['run_seconds']:.2f} s for {robots} robots, {rate}"))
-        rows.append(("real time", f"{speed}; all {robots} at {factor}"))
+        if s["time_unit"] == "s":
+            speed = f"{this['robot_seconds_per_second']:,.4g} robot-seconds/s"
+            factor = f"{this['real_time_factor']:.3g} times real time"
+            rows.append(("real time", f"{speed}; all {robots} at {factor}"))
     return rows
 
 

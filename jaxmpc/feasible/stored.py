@@ -360,7 +360,7 @@ def open_labels(
     constants |= {
         name: Constant(np.array(list(values), str), (name,)) for name, values in texts.items()
     }
-    about_time = {"long_name": "time of the input", "units": "s" if system.dt else "1"}
+    about_time = {"long_name": "time of the input", "units": system.time_unit if system.dt else "1"}
     times = (system.dt or 1.0) * np.arange(mpc.horizon)
     constants["time"] = Constant(times, ("time",), about_time)
     attributes = {"problem": problem.plain()}

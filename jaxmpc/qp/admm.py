@@ -432,22 +432,24 @@ class ScaledProgram:
     def typical_sizes(self, w: Array, y: Array) -> TypicalSizes:
         """Return the sizes that are typical of the program at w, y in ADMM's coordinates.
 
-        Where P is singular a gradient is no length: gradients are compared with q and y there, and
-        rows with |w| and the nearest of the bounds that are not 0."""
+        Rows are compared with |w| and the nearest of the bounds that are not 0, or with |q|, the
+        minimiser without rows, if that is nearer. Where P is singular a gradient is no length:
+        gradients are compared with q and y there, and |q| does not count."""
         f, unit = self.factor, self.unit
         norm_w, norm_q, norm_y = map(infinity_norm, (w, self.q, y))
         gradient = jnp.maximum(norm_q, norm_y)
         ends = jnp.stack([jnp.abs(self.bounds.l), jnp.abs(self.bounds.u)])
         nearest = jnp.min(jnp.where(ends > 0, ends, jnp.inf), initial=jnp.inf)
+        nearest = jnp.where(f.flat, nearest, jnp.minimum(nearest, norm_q))
         nearest = jnp.where(jnp.isfinite(nearest), nearest, 1.0)
-        primal = unit * jnp.where(f.flat, norm_w + nearest, norm_w)
+        primal = unit * (norm_w + nearest)
         dual = unit * jnp.where(f.flat, gradient, norm_w)
         terms = unit * jnp.where(f.flat, norm_w, norm_w + gradient)
         per_variable = 1 / jnp.sum(jnp.abs(f.T), axis=1)
         return TypicalSizes(
             rows=primal * f.row_norms,
             variables=dual * per_variable,
-            gap=primal * dual,
+            gap=primal * dual + unit**2 * nearest * gradient,
             row_terms=terms * f.row_norms,
             variable_terms=unit * gradient * per_variable,
         )

@@ -31,7 +31,7 @@ from jax import Array
 
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.jax_transformations import tree_where
-from jaxmpc.qp.linalg import infinity_norm, matmul, precisely, rounding
+from jaxmpc.qp.linalg import infinity_norm, matmul, precisely, rounding, solve
 from jaxmpc.qp.problem import QP, Bounds, QPSolution, finite
 from jaxmpc.qp.status import Status
 
@@ -45,6 +45,8 @@ SHARE = 1e-3
 Terms = Sequence[tuple[Array, Array, Array]]
 # Tolerance of a ray's products, in multiples of `rounding`: rays are solutions of linear systems.
 RAY = 25
+# Entries of a Farkas vector, relative to the largest in ADMM's coordinates, that count as zero.
+INACTIVE = 1e-13
 # Rows that correct a certificate, and their entries: see `correcting_rows`.
 Correcting = tuple[Array, Array]
 
@@ -118,8 +120,11 @@ def terms_of(
     # A penalty is a multiple of a violation, which is a difference of the terms of its row.
     terms = jnp.sum(jnp.abs(z) * (jnp.abs(Pz) + jnp.abs(q)))
     terms = terms + jnp.sum(bounds.slope(Az) * sizes[0] + penalty + jnp.abs(support))
+    of_rows = row_sizes(Az, known, typical)
+    # Where bounds hold the solution at zero all sums of the gap vanish.
+    least = typical.gap + jnp.sum(jnp.abs(y) * of_rows)
     return [
-        (bounds.violation(Az), row_sizes(Az, known, typical), sizes[0] + typical.row_terms),
+        (bounds.violation(Az), of_rows, sizes[0] + typical.row_terms),
         (
             Pz + q + Aty,
             abs(Pz) + abs(q) + abs(Aty) + SHARE * typical.variables,
@@ -127,7 +132,7 @@ def terms_of(
         ),
         (
             (curved + along + paid + conjugate)[None],
-            (abs(curved) + abs(along) + paid + abs(conjugate) + SHARE * typical.gap)[None],
+            (abs(curved) + abs(along) + paid + abs(conjugate) + SHARE * least)[None],
             terms[None],
         ),
     ]
@@ -264,7 +269,9 @@ def prove(
         return replace(Proof.none(ray, y), ray=ray, unbounded=unbounded)
     # Rows that z cannot move prove emptiness by themselves.
     fixed = jnp.where(E == 0, qp.bounds.violation(jnp.zeros_like(E)), 0.0)
-    candidate = jnp.where(jnp.any(fixed != 0), fixed, E * y)
+    # Multipliers that are rounding of others push variables that nothing else pushes.
+    y = jnp.where(jnp.abs(y) > INACTIVE * infinity_norm(y), y, 0.0)
+    candidate = jnp.where(jnp.any(fixed != 0), fixed, balanced(qp, E * y))
     return Proof(*farkas(qp, candidate, correcting, tolerances), ray, unbounded)
 
 
@@ -319,6 +326,18 @@ def farkas(
     bound = jnp.sum(jnp.concatenate([support + gamma * jnp.abs(support), leak]))
     proved, beyond = bound < 0, bound + jnp.sum(tolerances * jnp.abs(y)) < 0
     return jnp.where(proved, y, 0.0), proved, beyond
+
+
+def balanced(qp: QP, y: Array) -> Array:
+    """Return the candidate y for a Farkas vector with what is left of A'y made up for by its own
+    rows: y − D A K⁻¹A'y with D = diag(y²) and K = A'DA, the least change relative to y that does
+    so. A variable without bounds allows no more to be left than rounding."""
+    y = to_length_one(qp.bounds.hard().admissible(y))
+    size = jnp.sqrt(jnp.sum((y[:, None] * qp.A) ** 2, axis=0))
+    A = qp.A / jnp.where(size > 0, size, 1.0)
+    K = matmul(A.T * y**2, A)
+    K = K + 10 * jnp.finfo(y.dtype).eps * jnp.eye(len(K), dtype=y.dtype)
+    return y - y**2 * matmul(solve(K, matmul(y, A)), A.T)
 
 
 def to_length_one(v: Array) -> Array:

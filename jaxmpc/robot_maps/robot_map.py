@@ -257,7 +257,8 @@ class RobotMap:
 
     def __str__(self) -> str:
         """Return the claim, table of counts, statuses and the deepest failure, one a line."""
-        what = f"{CLAIMS[self.claim]} for {self.seconds:g} s, {self.steps} time steps"
+        span = f"{self.seconds:g} {self.robot.time_unit}"
+        what = f"{CLAIMS[self.claim]} for {span}, {self.steps} time steps"
         rows = [("claim", what)]
         for name, row in self.counts().items():
             if sum(row.values()) or name != "undecided":

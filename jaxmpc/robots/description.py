@@ -83,6 +83,11 @@ class RobotDescription:
     shapes: Any = static(default=None)
 
     @property
+    def time_unit(self) -> str:
+        """Return the unit of `dt`: MuJoCo's models are in seconds."""
+        return "s"
+
+    @property
     def mujoco(self) -> "mujoco.MjModel":
         """Return the plant as MuJoCo's own model, for rendering and the C engine."""
         return self.plant.model

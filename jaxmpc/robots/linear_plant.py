@@ -68,9 +68,14 @@ class LinearPlant:
 
     @property
     def dt(self) -> float:
-        """Return the control period (s)."""
+        """Return the control period, in the system's unit of time."""
         assert self.system.dt is not None
         return self.system.dt
+
+    @property
+    def time_unit(self) -> str:
+        """Return the unit of the control period."""
+        return self.system.time_unit
 
     def step(self, x: Any, u: Any) -> Array:
         """Return the next state (n,)."""

@@ -37,9 +37,10 @@ class LinearSystem:
         A: (n, n), state to next state.
         B: (n, m), input to next state.
         c: (n,) constant drift, or None for zero. Linearizing off an equilibrium gives one.
-        dt: sampling period in seconds, or None where it does not matter.
+        dt: sampling period in seconds, or in `time_unit`, or None where it does not matter.
         state_names, input_names: tuples of n and m names; empty means x1..xn, u1..um.
         state_units, input_units: tuples of n and m units ("rad", "N m"); empty means none.
+        time_unit: unit of dt, "s" or another ("h"), in which reports and plots give times too.
 
     In an `MPC` each of A, B and c may have a leading axis of N steps.
     A, B and c are pytree leaves (they may be batched and differentiated); the rest is
@@ -54,6 +55,7 @@ class LinearSystem:
     input_names: tuple[str, ...] = static(default=())
     state_units: tuple[str, ...] = static(default=())
     input_units: tuple[str, ...] = static(default=())
+    time_unit: str = static(default="s")
 
     def __post_init__(self) -> None:
         store_floats(self, "A", "B", "c")
@@ -116,6 +118,9 @@ class LinearSystem:
             require_shape("c", self._at_one_step("c", 1, steps), (n,), cure)
         if self.dt is not None:
             require_period("dt", self.dt)
+        if not isinstance(self.time_unit, str) or not self.time_unit:
+            fail("time_unit", f"{self.time_unit!r} is no unit", 'Write it as "s", "min" or "h"')
+        require_printable("time_unit", self.time_unit)
         for kind, count in (("state", n), ("input", m)):
             for what in (f"{kind}_names", f"{kind}_units"):
                 _require_strings(what, getattr(self, what), count)
@@ -135,7 +140,14 @@ class LinearSystem:
 
     @classmethod
     def from_continuous(
-        cls, A: Reals, B: Reals, dt: float, c: Reals | None = None, **names: tuple[str, ...]
+        cls,
+        A: Reals,
+        B: Reals,
+        dt: float,
+        c: Reals | None = None,
+        *,
+        time_unit: str = "s",
+        **names: tuple[str, ...],
     ) -> "LinearSystem":
         """Sample dx/dt = A x + B u + c exactly, the input held constant over each period.
 
@@ -145,7 +157,8 @@ class LinearSystem:
 
         Arguments:
             A: (n, n) in 1/s, B: (n, m), c: (n,) or None: continuous-time matrices.
-            dt: sampling period in seconds.
+            dt: sampling period in seconds, or in `time_unit`, of which A is the inverse then.
+            time_unit: unit of dt.
             names: state_names, input_names, state_units, input_units.
 
         Raises ValueError for bad shapes or values, or dt <= 0.
@@ -154,12 +167,13 @@ class LinearSystem:
         for key, value in names.items():
             if key not in _TEXTS:
                 delayed = "delay" in key.lower() or "latency" in key.lower()
-                cure = _DELAY if delayed else f"{nearest(key, _TEXTS)}Leave it out"
-                fail(key, f"is no argument (A, B, dt, c, {', '.join(_TEXTS)} are)", cure)
+                known = (*_TEXTS, "time_unit")
+                cure = _DELAY if delayed else f"{nearest(key, known)}Leave it out"
+                fail(key, f"is no argument (A, B, dt, c, {', '.join(known)} are)", cure)
             if not isinstance(value, list | tuple):
                 fail(key, f"{value!r} is not a tuple of strings", 'Write it as ("q", "dq")')
         texts: dict[str, Any] = {key: tuple(value) for key, value in names.items()}
-        continuous = cls(A, B, c, dt, **texts)
+        continuous = cls(A, B, c, dt, time_unit=time_unit, **texts)
         continuous.validate()
         n, m = continuous.n, continuous.m
         M = np.zeros((n + m + 1, n + m + 1))

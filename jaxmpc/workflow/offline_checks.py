@@ -105,7 +105,7 @@ class OfflineReport:
 
     def __str__(self) -> str:
         mpc, system = self.mpc, self.mpc.system
-        span = f" ({mpc.horizon * system.dt:g} s)" if system.dt else ""
+        span = f" ({mpc.horizon * system.dt:g} {system.time_unit})" if system.dt else ""
         problem = (
             f"{counted(system.n, 'state')}, {counted(system.m, 'input')}, "
             f"horizon {mpc.horizon}{span}\n"

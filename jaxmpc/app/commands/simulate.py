@@ -78,7 +78,8 @@ class Simulate(SimulateOptions):
             wait.begin(f"closed loops of {robot.name}", programs=1)
             mpc = command.problem(robot, target, file)
             starts, factors = draw_robots(robot, **arguments(self, draw_robots, leave=("robot",)))
-            print(f"{robot.name}: {self.count:,} robots for {self.seconds:g} s -> {self.output}")
+            length = f"{self.seconds:g} {robot.time_unit}"
+            print(f"{robot.name}: {self.count:,} robots for {length} -> {self.output}")
             with jax.enable_x64(self.dtype == "float64"):
                 runs = simulate_into(
                     path,

@@ -2,7 +2,8 @@
 
     name = "joint"
 
-    [system]  A, B, c, dt, continuous, state_names, state_units, input_names, input_units
+    [system]  A, B, c, dt, continuous, state_names, state_units, input_names, input_units,
+             time_unit
     [limits]  x_min, x_max, margin  or  H_x, h_x;  u_min, u_max, input_rate_limit
     [cost]    Q, R, P, rho, input_rate_weight, stage_weights
     [mpc]     horizon, terminal  or  H_f, h_f  or  P_f, level_f;  constrain_initial,

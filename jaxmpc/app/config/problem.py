@@ -68,12 +68,13 @@ class SystemSection:
     A: Matrix  # (n, n)
     B: Matrix  # (n, m)
     c: Vector | None = None  # (n,), none means zero
-    dt: Annotated[Number, Field(gt=0)]  # seconds
+    dt: Annotated[Number, Field(gt=0)]  # seconds, or in time_unit
     continuous: Switch = False  # True: convert by zero-order hold
     state_names: tuple[str, ...] | None = None
     state_units: tuple[str, ...] | None = None
     input_names: tuple[str, ...] | None = None
     input_units: tuple[str, ...] | None = None
+    time_unit: str = "s"  # of dt and, in its inverse, of a continuous A
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -211,7 +212,7 @@ SECTION_COMMANDS = ("sweep", "recursion")
 # Arguments by which errors of the library name what these keys give.
 KEYS = {
     **{name: f"system.{name}" for name in ("A", "B", "c", "dt", "state_names", "state_units")},
-    **{name: f"system.{name}" for name in ("input_names", "input_units")},
+    **{name: f"system.{name}" for name in ("input_names", "input_units", "time_unit")},
     "Q": "cost.Q",
     "R": "cost.R",
     "terminal_cost": "cost.P",
@@ -338,6 +339,7 @@ class Config:
             input_names=s.input_names or (),
             state_units=s.state_units or (),
             input_units=s.input_units or (),
+            time_unit=s.time_unit,
         )
         states = self.state_limits()
         if isinstance(states, Box) and limits.margin:

@@ -74,10 +74,10 @@ class SweepOptions:
       robot_map.zarr The state for --resume: a killed run loses the blocks of 256 states
                      that run or are being written.
 
-    What the TOML file holds (n states, m inputs; dt in seconds, other units are yours)
+    What the TOML file holds (n states, m inputs; dt in seconds or in time_unit)
       name = "joint"
       [system]  A, B, dt; optional c, state_names, state_units, input_names, input_units,
-                continuous = true (A, B, c of dx/dt, the input held over dt)
+                time_unit = "s", continuous = true (A, B, c of dx/dt, the input held over dt)
       [limits]  u_min, u_max, and x_min, x_max (inf allowed) or H_x, h_x (H_x x <= h_x); optional
                 input_rate_limit: |u(k) - u(k-1)| <= it; states are then (x, previous u)
       [cost]    Q, R, P = "lqr" | "Q" | "none" | matrix; a flat list is a diagonal; optional rho,

@@ -19,7 +19,7 @@ from jaxmpc.app.plots.style import (
     Style,
     patch,
 )
-from jaxmpc.checks import fail
+from jaxmpc.checks import counted, fail
 from jaxmpc.closed_loop.outcome import with_limits
 from jaxmpc.closed_loop.simulation import Run
 from jaxmpc.qp.status import Status
@@ -70,9 +70,11 @@ def plot_runs(
         _draw_lines(ax, time, values.T, parts, broken.T)
         draw_limits(ax, plant, kind, i, (reference, input_reference)[kind], time)
     whole = kept[0].all(axis=(1, 2)) & kept[1].all(axis=(1, 2))
+    loops = f"{counted(count, 'closed loop')} of {time[-1]:g} {plant.time_unit}"
+    kept_by = f"{np.count_nonzero(whole):,} of {count:,}"
     counts = (
-        f"{plant.name}: {count:,} closed loop{'s' * (count > 1)} of {time[-1]:g} s, {len(shown):,} "
-        f"shown. Limits kept by {np.count_nonzero(whole):,} of {count:,}\n{_plans_text(plans)}"
+        f"{plant.name}: {loops}, {len(shown):,} shown. Limits kept by {kept_by}\n"
+        f"{_plans_text(plans)}"
     )
     line = lambda label, **style: Line2D([], [], label=label, **style)
     handles: list[Any] = [
@@ -194,7 +196,7 @@ def panel_grid(
     for part, (title, panels) in zip(parts, columns, strict=True):
         column = part.subplots(len(panels), sharex=True, squeeze=False)[:, 0]
         column[0].set_title(title, fontsize=9)
-        column[-1].set_xlabel("time [s]", fontsize=8)
+        column[-1].set_xlabel(f"time [{plant.time_unit}]", fontsize=8)
         for ax, (kind, i, label) in zip(column, panels, strict=True):
             ax.set_ylabel(label, fontsize=8)
             ax.tick_params(labelsize=7)

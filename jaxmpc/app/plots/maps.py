@@ -184,7 +184,8 @@ def plot_robot_map(rmap: RobotMap, ax: Axes | None = None) -> Axes:
     marks = [(rmap.set_point[list(linear.axes)], "set-point", cross)]
     worst = rmap.worst()
     if worst is not None:
-        name = f"deepest failure,\nfails after {rmap.first_loss[worst] * rmap.robot.dt:.3g} s"
+        unit = rmap.robot.time_unit
+        name = f"deepest failure,\nfails after {rmap.first_loss[worst] * rmap.robot.dt:.3g} {unit}"
         circle: Style = {"marker": "o", "ms": 6, "mfc": "white", "mec": "black"}
         marks.append((points[worst], name, circle))
     for (x, y), name, style in marks:
@@ -233,8 +234,9 @@ def _robot_map_title(rmap: RobotMap) -> str:
     mpc, what = rmap.linear.mpc, "does the robot keep having plans"
     if rmap.claim == "limits":
         what = "is a feasible state safe on the robot"
-    steps = f"N = {mpc.horizon} steps of {rmap.robot.dt:g} s"
-    first = f"{name}: {what} for {rmap.seconds:g} s?\n{steps}"
+    unit = rmap.robot.time_unit
+    steps = f"N = {mpc.horizon} steps of {rmap.robot.dt:g} {unit}"
+    first = f"{name}: {what} for {rmap.seconds:g} {unit}?\n{steps}"
     labels = mpc.system.state_labels
     others = [i for i in range(len(labels)) if i not in rmap.linear.axes]
     fixed = rmap.linear.fixed

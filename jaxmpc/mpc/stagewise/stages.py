@@ -368,6 +368,7 @@ def residuals_of(s: Stages, u: Array, y: Array, found: Optimality) -> Terms:
     gradient_size = found.gradient_size + SHARE * jnp.max(found.gradient_size, axis=0)
     gradient_terms = found.gradient_terms + jnp.max(found.gradient_terms, axis=0)
     row_sizes = row_size + SHARE * most(row_size)
+    size = size + SHARE * jnp.sum(jnp.abs(y) * row_sizes)
     return [
         (bounds.violation(found.rows), row_sizes, row_terms + most(row_terms)),
         (found.gradient.ravel(), gradient_size.ravel(), gradient_terms.ravel()),

@@ -1,0 +1,66 @@
+"""Plans under limits of one side, at zero and away from it: solved, or proved infeasible."""
+
+import numpy as np
+import pytest
+from scipy.optimize import linprog
+
+import jaxmpc as jm
+from jaxmpc import Status
+
+n, m, N = 2, 2, 4
+# Ends of an interval, in units of its quantity.
+ENDS = [(-1.0, 1.5), (0.0, 1.2), (-0.8, 0.0), (0.0, np.inf), (0.5, 1.5), (-1.2, np.inf)]
+
+
+def draw(rng):
+    """Return a problem with limits of random kinds, in random units, and states to plan from."""
+    xs, us = 10.0 ** rng.uniform(-3, 3, n), 10.0 ** rng.uniform(-3, 3, m)
+    A = rng.normal(size=(n, n)) if rng.uniform() < 0.5 else rng.uniform(size=(n, n))
+    A *= rng.uniform(0.6, 1.1) / np.abs(np.linalg.eigvals(A)).max()
+    x, u, y = (np.array([ENDS[k] for k in rng.integers(6, size=2)]).T for _ in range(3))
+    C, D = rng.normal(size=(2, n)), rng.normal(size=(2, m))
+    mpc = jm.MPC(
+        jm.LinearSystem(A * xs[:, None] / xs, rng.normal(size=(n, m)) * xs[:, None] / us, dt=1.0),
+        np.diag(1 / xs**2), np.diag(0.1 / us**2), N, terminal_cost=np.diag(1 / xs**2),
+        states=jm.Box(*(x * xs)), inputs=jm.Box(*(u * us)), constrain_initial=False,
+        outputs=jm.Outputs(C / xs, *y, D=D / us),
+    )  # fmt: skip
+    least, most = x[0], np.minimum(x[1], x[0] + 2.5)
+    return mpc, xs * (least + (most - least) * rng.uniform(-0.1, 1.1, (32, n)))
+
+
+def room(mpc, x0):
+    """Return the largest t such that some inputs keep all limits by t times their size (HiGHS)."""
+    A, B = np.asarray(mpc.system.A), np.asarray(mpc.system.B)
+    powers = [np.linalg.matrix_power(A, k) for k in range(N)]
+    rows, ends = [], []
+    for k in range(N):
+        moved = np.hstack([powers[k - 1 - j] @ B if j < k else 0 * B for j in range(N)])
+        own = np.hstack([np.eye(m) if j == k else np.zeros((m, m)) for j in range(N)])
+        out, free = mpc.outputs, powers[k] @ x0
+        parts = [(own, np.zeros(m), mpc.inputs)]
+        if k > 0:
+            parts += [(moved, free, mpc.states)]
+            parts += [(out.C @ moved + out.D @ own, out.C @ free, out)]
+        for M, at, set_ in parts:
+            size = [max(abs(v) for v in pair if np.isfinite(v)) or 1.0
+                    for pair in zip(set_.lower, set_.upper, strict=True)]  # fmt: skip
+            for side, bound in ((1, set_.upper), (-1, set_.lower)):
+                there = np.isfinite(bound)
+                rows.append(side * (M / np.array(size)[:, None])[there])
+                ends.append(side * ((bound - at) / size)[there])
+    H, h = np.vstack(rows), np.concatenate(ends)
+    scale = 1 / np.abs(H).max(axis=0)
+    cost, with_t = np.append(np.zeros(N * m), -1.0), np.hstack([H * scale, np.ones((len(h), 1))])
+    found = linprog(cost, with_t, h, bounds=[(None, None)] * (N * m) + [(None, 1)])
+    return -found.fun
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_each_plan_is_solved_or_proved_infeasible(seed):
+    mpc, x0s = draw(np.random.default_rng(seed))
+    plans = jm.solve_many(mpc, x0s)
+    rooms = np.array([room(mpc, x0) for x0 in x0s])
+    clear = np.abs(rooms) > 1e-5
+    expected = np.where(rooms > 0, Status.SOLVED, Status.PRIMAL_INFEASIBLE)
+    np.testing.assert_array_equal(plans.status[clear], expected[clear])
