@@ -448,7 +448,8 @@ def advance(most: int, given: RefinementData, s: Refinement) -> Refinement:
     q = s.q + gradient - (matmul(point.w, f.H) + s.q + matmul(point.y, f.A))
     ray = jnp.where(distance, point.move, step.w)
     y = jnp.where(primal, point.change, step.excess)
-    proof = s.proof.joined(prove(p.qp, f.T, f.E, given.correcting, tolerances, y, ray))
+    proved = prove(p.qp, f.T, f.E, given.correcting, tolerances, y, ray, balance=True)
+    proof = s.proof.joined(proved)
     # Where there is no answer, the best is the point of least violation, at which this ends.
     best = tree_where(primal, s.best.or_better(pair), s.best)
     idle = jnp.where(best.error < 0.5 * s.best.error, 0, s.idle + 1)

@@ -259,11 +259,19 @@ class Proof:
 
 
 def prove(
-    qp: QP, T: Array, E: Array, correcting: Correcting, tolerances: Array, y: Array, d: Array
+    qp: QP,
+    T: Array,
+    E: Array,
+    correcting: Correcting,
+    tolerances: Array,
+    y: Array,
+    d: Array,
+    *,
+    balance: bool = False,
 ) -> Proof:
     """Return what is proved of the program by candidates for a Farkas vector y and a ray d, both in
     ADMM's coordinates (`admm.scale`). correcting: `correcting_rows(qp)`. tolerances (m,): by how
-    much rows may be violated."""
+    much rows may be violated. balance: try the vector `balanced`."""
     ray, unbounded = descent_ray(qp, matmul(d, T.T))
     if not y.shape[0]:
         return replace(Proof.none(ray, y), ray=ray, unbounded=unbounded)
@@ -271,7 +279,8 @@ def prove(
     fixed = jnp.where(E == 0, qp.bounds.violation(jnp.zeros_like(E)), 0.0)
     # Multipliers that are rounding of others push variables that nothing else pushes.
     y = jnp.where(jnp.abs(y) > INACTIVE * infinity_norm(y), y, 0.0)
-    candidate = jnp.where(jnp.any(fixed != 0), fixed, balanced(qp, E * y))
+    y = balanced(qp, E * y) if balance else E * y
+    candidate = jnp.where(jnp.any(fixed != 0), fixed, y)
     return Proof(*farkas(qp, candidate, correcting, tolerances), ray, unbounded)
 
 
