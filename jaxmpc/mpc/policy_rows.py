@@ -409,7 +409,7 @@ def _tube(nominal: Condensed, mpc: MPC, gain: Array, section: Zonotope) -> Polic
     center, generators = (jnp.asarray(v, dtype) for v in (section.center, section.generators))
     moves = jax.vmap(along)(generators.T).T
     bounds = [(low.ravel(), high.ravel()) for low, high in tightened_by(mpc, section, found, K)]
-    lower, upper = (jnp.concatenate([*side, center[:0]]) for side in zip(*bounds, strict=True))
+    lower, upper = (jnp.concatenate([*(pair[k] for pair in bounds), center[:0]]) for k in (0, 1))
     count = generators.shape[1]
     one, zero = jnp.eye(count, dtype=dtype), jnp.zeros((count, nominal.C.shape[1]), dtype)
     extent, sizes = None, _input_sizes(mpc, dtype)

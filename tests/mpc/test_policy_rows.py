@@ -196,6 +196,14 @@ def least_first_inputs(mpc: jm.MPC, states: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("policy", ["affine", "tube"])
+def test_without_limits_the_nominal_inputs_are_those_of_the_lqr(policy):
+    mpc = robust(policy, terminal_set=None)
+    found = plans(replace(mpc, states=None, inputs=None), STATES[:2])
+    assert (found.status == jm.Status.SOLVED).all()
+    np.testing.assert_allclose(found.inputs[:, 0], STATES[:2] @ LAW.K.T, atol=1e-7)
+
+
+@pytest.mark.parametrize("policy", ["affine", "tube"])
 def test_units_play_no_part(policy):
     """The steps of ADMM, in scaled rows, are those of the problem in other units of states, input
     and cost, and with longer rows of the terminal set."""
