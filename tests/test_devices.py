@@ -213,6 +213,10 @@ def check_weights_by_reverse_mode():
     weights("reverse")
 
 
+def check_weights_by_gauss_newton_steps():
+    weights("gauss-newton")
+
+
 def check_feasible_set():
     import jaxmpc as jm
 
@@ -305,6 +309,7 @@ def check_refusals():
 
 CHECKS = {name: found for name, found in globals().items() if name.startswith("check_")}
 QUICK = ("check_map", "check_programs", "check_refusals")
+LONG = ("check_weights_by_gauss_newton_steps",)  # whose candidates are those of samples too
 
 
 def one_of_two(process, port, folder):
@@ -362,7 +367,12 @@ def test_on_four_devices():
 
 @pytest.mark.slow
 def test_more_on_four_devices():
-    passed([name for name in CHECKS if name not in QUICK])
+    passed([name for name in CHECKS if name not in QUICK + LONG])
+
+
+@pytest.mark.slow
+def test_long_ones_on_four_devices():
+    passed(LONG)
 
 
 @pytest.mark.slow

@@ -40,6 +40,8 @@ FORWARD = 32
 WIDTH = 0.1
 # Damping of Gauss-Newton steps, in shares of the curvature by each θ.
 DAMPING = 10.0 ** np.arange(-5, 4)
+# The most by which such a step moves a number θ: a weight by a factor of 7.
+LARGEST = 2.0
 # Primitives of linear algebra, of cubic cost.
 FACTORING = ("cholesky", "triangular_solve", "lu", "eigh", "qr", "householder_product", "svd")
 
@@ -268,11 +270,11 @@ class ClosedLoopObjective:
         return slope
 
     def gauss_newton(self, theta: Any, devices: Devices) -> Slope:
-        """Return minus the best of several damped Gauss-Newton steps (Levenberg-Marquardt).
+        """Return minus the best of several damped Gauss-Newton steps (Levenberg and Marquardt).
 
         With H the second derivatives of the mean loss by the states and inputs of the loops, and J
-        their derivatives by θ, steps are −(J'HJ + damping)⁻¹ gradient; the one with the least loss
-        is taken, none where no step lessens it.
+        their derivatives by θ, these are `damped_steps` of C = J'HJ; the one with the least loss is
+        taken, none where no step lessens it.
         """
         unravel = ravel_pytree(arrays(theta))[1]
 
@@ -297,7 +299,8 @@ class ClosedLoopObjective:
 
             bend = lambda move: jax.jvp(jax.grad(loss), (path,), (move,))[1]
             both = zip(moves, jax.vmap(bend)(moves), strict=True)
-            curvature = sum(jnp.einsum("i...,j...->ij", move, bent) for move, bent in both)
+            product = partial(jnp.einsum, "i...,j...->ij", precision="highest")
+            curvature = sum(product(move, bent) for move, bent in both)
             return value, (gradient, curvature), numbers
 
         program = self.over(curved, devices)
@@ -332,12 +335,17 @@ def flattened(theta: Any) -> tuple[np.ndarray, Callable]:
 
 
 def damped_steps(gradient: np.ndarray, curvature: np.ndarray) -> np.ndarray:
-    """Return −(C + μ s I)⁻¹ gradient for each damping μ, (P, k): C the curvature without its
-    negative part, s the mean of its eigenvalues (where it is zero, of the size of the gradient)."""
+    """Return −(|C| + μ s I)⁻¹ gradient for each damping μ, (P, k), shortened where it moves a
+    number by more than LARGEST.
+
+    |C| has the absolute eigenvalues of the curvature, s is their mean (where it is zero, the size
+    of the gradient).
+    """
     sizes, vectors = np.linalg.eigh((curvature + curvature.T) / 2)
-    sizes = np.maximum(sizes, 0.0)
+    sizes = np.abs(sizes)
     scale = np.mean(sizes) or np.linalg.norm(gradient) or 1.0
-    return -(vectors.T @ gradient / (sizes + DAMPING[:, None] * scale)) @ vectors.T
+    steps = -(vectors.T @ gradient / (sizes + DAMPING[:, None] * scale)) @ vectors.T
+    return steps / np.maximum(1.0, np.abs(steps).max(axis=1, keepdims=True) / LARGEST)
 
 
 def cheapest(programs: dict[str, BatchMean], arguments: tuple) -> str:

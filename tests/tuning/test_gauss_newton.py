@@ -9,7 +9,7 @@ import pytest
 
 import jaxmpc as jm
 from jaxmpc.tuning import Parameter, tune_weights
-from jaxmpc.tuning.objective import DAMPING, damped_steps
+from jaxmpc.tuning.objective import DAMPING, LARGEST, damped_steps
 
 SYSTEM = jm.LinearSystem(np.array([[1.0, 0.2], [0.0, 1.0]]), np.array([[0.02], [0.2]]), dt=0.2)
 MPC = jm.MPC(SYSTEM, np.eye(2), np.eye(1), 5, inputs=jm.Box([-1.0], [1.0]))
@@ -24,17 +24,22 @@ def make(v):
 
 
 def test_damped_steps_solve_their_equations():
+    """With the absolute eigenvalues of the curvature; no number moves by more than LARGEST."""
     rng = np.random.default_rng(0)
     M, gradient = rng.normal(size=(3, 3)), rng.normal(size=3)
-    for C, positive in ((M @ M.T, M @ M.T), (np.diag([2.0, -1.0, 1.0]), np.diag([2.0, 0.0, 1.0]))):
-        scale = np.trace(positive) / 3
+    for C, positive in ((M @ M.T, M @ M.T), (np.diag([2.0, -1.0, 1.0]), np.diag([2.0, 1.0, 1.0]))):
+        scale, short = np.trace(positive) / 3, 0
         for mu, step in zip(DAMPING, damped_steps(gradient, C), strict=True):
-            left = (positive + mu * scale * np.eye(3)) @ step
-            np.testing.assert_allclose(left, -gradient, rtol=1e-9)
+            whole = np.linalg.solve(positive + mu * scale * np.eye(3), -gradient)
+            most = np.abs(whole).max()
+            short += most > LARGEST
+            np.testing.assert_allclose(step, whole * min(1, LARGEST / most), rtol=1e-9)
+        assert short < len(DAMPING)
     # Without curvature: along the gradient, its length that of 1/μ.
     steps = damped_steps(gradient, np.zeros((3, 3)))
     unit = gradient / np.linalg.norm(gradient)
-    np.testing.assert_allclose(steps, -unit / DAMPING[:, None])
+    np.testing.assert_allclose(steps[DAMPING >= 1], -unit / DAMPING[DAMPING >= 1, None])
+    np.testing.assert_allclose(np.abs(steps).max(axis=1)[0], LARGEST)
 
 
 def test_hidden_weights_are_found_in_a_few_steps():

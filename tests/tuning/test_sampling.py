@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from c_engine import c_steps
 
 import jaxmpc as jm
 from jaxmpc.tuning import Parameter, tune_weights
@@ -126,3 +127,55 @@ def test_a_run_by_samples_that_is_cut_off_goes_on_as_if_it_had_not_been(tmp_path
     whole = tuned(x0s, mode="sampling", updates=6).history
     np.testing.assert_array_equal(again.thetas["Q"], whole.thetas["Q"])
     assert whole.numbers["excluded"].tolist() == [1.0] * 6 and whole.accepted.all()
+
+
+SLIDER = """<mujoco><option timestep="0.01"/><worldbody>
+<geom type="box" size=".05 1 1" pos="-0.15 0 0"/>
+<body><joint name="x" type="slide" axis="1 0 0" frictionloss="1.5"/>
+<geom type="sphere" size=".1" mass="1"/></body></worldbody>
+<actuator><motor joint="x" ctrlrange="-5 5"/></actuator></mujoco>"""
+
+
+class Engine:
+    """MuJoCo's C engine: a slider with dry friction, a wall at its target; 5 steps a sample."""
+
+    def __init__(self):
+        mujoco = pytest.importorskip("mujoco")
+        self.model = mujoco.MjModel.from_xml_string(SLIDER)
+
+    def steps(self, x, u):
+        x, u = np.asarray(x), np.asarray(u)
+        pairs = zip(x.reshape(-1, 2), u.reshape(-1, 1), strict=True)
+        found = [c_steps(self.model, *pair, 5) for pair in pairs]
+        return np.array(found, np.float32).reshape(x.shape)
+
+    def step(self, x, u):
+        shape = jax.typeof(x)
+        return jax.pure_callback(self.steps, shape, x, u, vmap_method="broadcast_all")
+
+
+@pytest.mark.slow
+def test_contacts_and_friction_of_the_c_engine():
+    engine = Engine()
+    system = jm.LinearSystem(np.array([[1, 0.05], [0, 1]]), np.array([[0.00125], [0.05]]), dt=0.05)
+    mpc = jm.MPC(system, np.eye(2), np.eye(1), 10, inputs=jm.Box([-5.0], [5.0]))
+    make = lambda v: replace(mpc, Q=v["Q"], R=v["R"], terminal_cost=10 * v["Q"])
+    loss = jm.ClosedLoopLoss([10.0, 0.1], [1e-3])
+    starts = lambda seed: np.random.default_rng(seed).uniform([0, -3], [1, 1], (24, 2))
+    found = tune_weights(
+        make, PARAMETERS, engine, starts(0), loss, 30, mode="sampling", updates=10,
+        optimizer=optax.adam(0.3), solver=SOLVER,
+    )  # fmt: skip
+
+    def mean_loss(values):
+        control, x = jax.jit(jax.vmap(lambda x: found.build(values)(x).u)), starts(1)
+        losses, nearest = [], np.inf
+        for _ in range(30):
+            u = np.asarray(control(x))
+            losses.append(x**2 @ [10.0, 0.1] + 1e-3 * u[:, 0] ** 2)
+            x = engine.steps(x, u)
+            nearest = min(nearest, x[:, 0].min())
+        return np.mean(losses), nearest
+
+    (before, _), (after, nearest) = mean_loss(found.initial), mean_loss(found.values)
+    assert after < 0.5 * before and nearest < 0  # some came to the wall
