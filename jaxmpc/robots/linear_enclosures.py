@@ -226,6 +226,6 @@ def _period(
             total_error = add(total_error, dot(way, left_out))
     zero = np.zeros(n)
     box = hull(total_error, Interval(zero, zero))
-    names = {"state_names": robot.state_names, "state_units": robot.state_units}
+    names: dict[str, Any] = {"state_names": robot.state_names, "state_units": robot.state_units}
     names |= {"input_names": robot.input_names, "input_units": robot.input_units}
     return LinearSystem(A_n, B_n, c, robot.dt, **names), Box(box.lower, box.upper)

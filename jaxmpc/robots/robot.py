@@ -114,8 +114,8 @@ class Robot(RobotDescription):
             c_1 = c
             for _ in range(self.substeps - 1):
                 A, B, c = matmul(A_1, A), matmul(A_1, B) + B_1, matmul(A_1, c) + c_1
-        states = {"state_names": self.state_names, "state_units": self.state_units}
-        inputs = {"input_names": self.input_names, "input_units": self.input_units}
+        states: dict[str, Any] = {"state_names": self.state_names, "state_units": self.state_units}
+        inputs: dict[str, Any] = {"input_names": self.input_names, "input_units": self.input_units}
         return LinearSystem(A, B, c, self.dt, **states, **inputs)
 
     def transition(self, x: Any, u: Any) -> tuple[Array, Array]:
