@@ -42,8 +42,6 @@ from scipy.stats import beta
 import jaxmpc as jm
 from jaxmpc.mpc.condense import condense
 
-jax.config.update("jax_enable_x64", True)
-
 
 @dataclass(frozen=True)
 class Settings:
@@ -306,7 +304,8 @@ def learn(s: Settings, error: float) -> tuple[Task, Network, jm.explicit.Network
 def run(s: Settings) -> list[jm.explicit.NetworkProof]:
     """Learn with each room for errors."""
     print(s)
-    return [learn(s, error)[2] for error in s.errors]
+    with jax.enable_x64(True):
+        return [learn(s, error)[2] for error in s.errors]
 
 
 if __name__ == "__main__":

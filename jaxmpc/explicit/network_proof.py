@@ -27,8 +27,8 @@ from jaxmpc.systems.system import LinearSystem, host_matrices
 
 # Simplices that a program takes at once.
 PART = 8192
-# What half-spaces of length one, in units of the set's size, have to keep beside rounding: sums of
-# float64 err by some 1e-13 here.
+# What half-spaces of length one, in units of the set's size, have to keep beside the roundings of
+# the bounds: those of whoever evaluates the network.
 MARGIN = 1e-9
 
 # Quantities (k,) over a simplex: M (k, n), t (k,), r (k,).
@@ -81,8 +81,9 @@ def prove_network(
         cells: that are looked at, at most.
 
     All states of a cell that counts as kept keep every half-space of the target by 1e-9 of the
-    set's size, far more than float64 errs here; roundings themselves are not enclosed. States with
-    one input alone that leads into the target stay undecided, however small the cells are.
+    set's size, and by what float64 may err in these bounds; `states` and `target` count as given.
+    States with one input alone that leads into the target stay undecided, however small the cells
+    are.
 
     Raises ValueError for wrong arguments, and sets that are empty, flat or unbounded.
     """
@@ -111,6 +112,7 @@ def prove_network(
     A, B, c = host_matrices(system)
     with jax.enable_x64(True):
         last = H @ A, H @ B, H @ c - h
+        margin = MARGIN + rounding_bound((layers, (low, high), last), np.abs(vertices).max(axis=0))
         network64 = jax.tree.map(jnp.asarray, (layers, (low, high), last))
         bounds = jax.jit(jax.vmap(excess_bounds, (None, 0)))
         whole_volume, kept, broken, count = float(_volumes(left).sum()), 0.0, 0.0, 0
@@ -120,7 +122,7 @@ def prove_network(
             parts = [bounds(network64, padded[i : i + PART]) for i in range(0, len(padded), PART)]
             least, most = (np.concatenate(v)[: len(left)] for v in zip(*parts, strict=True))
             count += len(left)
-            volume, proved, refuted = _volumes(left), most <= -MARGIN, least >= MARGIN
+            volume, proved, refuted = _volumes(left), most <= -margin, least >= margin
             kept += float(volume[proved].sum())
             broken += float(volume[refuted].sum())
             left = _halves(left[~proved & ~refuted], size)
@@ -154,17 +156,37 @@ def excess_bounds(network: Any, corners: Array) -> tuple[Array, Array]:
         half = jnp.where(split, -slope * a / 2, 0.0)
         return slope[:, None] * M, slope * t + half, slope * r + half
 
-    n = corners.shape[1]
-    found = jnp.eye(n), jnp.zeros(n), jnp.zeros(n)
+    n, dtype = corners.shape[1], corners.dtype
+    found = jnp.eye(n, dtype=dtype), jnp.zeros(n, dtype), jnp.zeros(n, dtype)
     for W, b in layers[:-1]:
         found = rectified(affine(W, b, found))
     # The clipped input is high − max(high − low − max(z − low, 0), 0).
     W, b = layers[-1]
-    minus = -jnp.eye(len(b))
+    minus = -jnp.eye(len(b), dtype=dtype)
     above = rectified(affine(W, b - low, found))
     M, t, r = affine(G @ minus, G @ high + g, rectified(affine(minus, high - low, above)))
     least, most = ends(M + F, t, r)
     return jnp.max(least), jnp.max(most)
+
+
+def rounding_bound(network: Any, reach: np.ndarray) -> float:
+    """Return more than the floating-point error of `excess_bounds` for corners within ± reach (n,).
+
+    Let g bound |M x| + |t| + r of each quantity. A layer takes it to |W| g + |b|, and max(·, 0) to
+    2 g at most, as the slope is at most 1 and half the band at most g / 2. Each entry is a sum of
+    at most k products, twice a layer with that at the corners, and as the errors of one layer grow
+    as its quantities do, 8 (k + 8) units in the last place of the last g for each layer are more
+    than all of them (Higham 2002, section 3.1).
+    """
+    layers, (low, high), (F, G, g) = network
+    size, width = reach, len(reach)
+    for i, (W, b) in enumerate(layers):
+        size = np.abs(W) @ (size if i == 0 else 2 * size) + np.abs(b)
+        width = max(width, W.shape[1])
+    span = 2 * (2 * (size + np.abs(low)) + np.abs(high) + np.abs(low))  # both ends of the limits
+    last = np.abs(F) @ reach + np.abs(G) @ (span + np.abs(high)) + np.abs(g)
+    each = 8 * (width + 8) * np.finfo(np.float64).eps
+    return float(each * (len(layers) + 4) * last.max())
 
 
 def _checked(network: Any, n: int, m: int) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -10,7 +10,7 @@ from scipy.spatial import ConvexHull
 
 import jaxmpc as jm
 from jaxmpc.explicit import prove_network
-from jaxmpc.explicit.network_proof import excess_bounds
+from jaxmpc.explicit.network_proof import excess_bounds, rounding_bound
 
 JOINT = jm.LinearSystem([[1, 0.1], [0, 1]], [[0.005], [0.1]])
 UNIT = jm.Box([-1.0, -1.0], [1.0, 1.0])
@@ -79,6 +79,28 @@ def test_bounds_hold_in_a_cell(seed):
             least, most = bounds(given, jnp.asarray(corners))
             assert least <= values.min() + 1e-12 and values.max() <= most + 1e-12
             assert most - least < gap
+
+
+def test_roundings_are_far_below_their_bound():
+    """Bounds in float32 differ from those in float64 by less than what float32 may err."""
+    random = np.random.default_rng(5)
+    network = random_network(5, [2, 24, 24, 1])
+    last = tuple(random.normal(size=shape) for shape in ((4, 2), (4, 1), (4,)))
+    given = network, (np.array([-1.0]), np.array([1.0])), last
+    corners = random.uniform(-1, 1, (500, 3, 2))
+    least = rounding_bound(given, np.ones(2))
+    with jax.enable_x64(True):
+        bounds = jax.jit(jax.vmap(excess_bounds, (None, 0)))
+
+        def found(kind):
+            arrays = jax.tree.map(lambda v: jnp.asarray(v, kind), (given, corners))
+            return np.stack(bounds(*arrays))
+
+        exact, rough = found(np.float64), found(np.float32)
+    assert rough.dtype == np.float32
+    off = np.abs(exact - rough).max()
+    assert 1e-8 < off < least * np.finfo(np.float32).eps / np.finfo(np.float64).eps / 10
+    assert least < 1e-9
 
 
 def test_open_cells_lie_in_the_set_and_have_its_share():
