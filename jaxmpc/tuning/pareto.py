@@ -132,11 +132,12 @@ def trade_off(
 
 def _given_weights(weights: int | Reals, count: int) -> int | np.ndarray:
     """Return weights (K, L), or the number of points, as given."""
-    if np.ndim(weights) == 0:
+    found = np.asarray(weights)
+    if found.ndim == 0:
         if count > 2:
             fail("weights", f"{weights} for {count} losses", f"Give weights (K, {count})")
         return whole("weights", weights, 2)
-    found = np.asarray(weights, np.float64)
+    found = found.astype(np.float64)
     if found.ndim != 2 or found.shape[1] != count or not len(found):
         fail("weights", f"shape {found.shape}", f"Give (K, {count}), one row a point")
     require_finite("weights", found)

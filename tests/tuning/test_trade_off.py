@@ -29,11 +29,23 @@ def options(**more):
     return {"mode": "forward", "input_reference": lambda v: v["goal"], **more}
 
 
+def stop_in_third_run(monkeypatch):
+    real, calls = weights.descend, []
+
+    def descend(*arguments):
+        calls.append(arguments)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return real(*arguments)
+
+    monkeypatch.setattr(weights, "descend", descend)
+
+
 def distance(end):
     return lambda run: jnp.sum((run.states[-1] - end) ** 2)
 
 
-def test_the_front_of_two_distances_is_known(tmp_path):
+def test_the_front_of_two_distances_is_known(tmp_path, monkeypatch):
     """The least of w |x − a|² + (1 − w) |x − b|² is at w a + (1 − w) b: there the losses are
     (1 − w)² d² and w² d², d = |a − b| = 5; Gauss-Newton steps are exact."""
     losses = {name: distance(end) for name, end in ENDS.items()}
@@ -53,6 +65,10 @@ def test_the_front_of_two_distances_is_known(tmp_path):
     assert found.record()["efficient"] == [True] * 3 and "point 2" in repr(found)
     again = call()  # goes on from the checkpoints, which are done
     np.testing.assert_array_equal(again.losses, found.losses)
+    stop_in_third_run(monkeypatch)
+    with pytest.raises(Interrupted, match="2 of 3 points") as stop:
+        call()
+    np.testing.assert_array_equal(stop.value.run.losses, found.losses[:2])
 
 
 @pytest.mark.slow
@@ -116,17 +132,8 @@ def test_the_best_of_several_starting_points(tmp_path, monkeypatch):
     assert found.before == first.before and found.initial["goal"][0] == 0.8
     assert "from start 2 of 4" in repr(found) and found.record()["starts"][3] is None
 
-    # Ctrl-C in the third run leaves the best of what there is.
-    real, calls = weights.descend, []
-
-    def descend(*arguments):
-        calls.append(arguments)
-        if len(calls) == 3:
-            raise KeyboardInterrupt
-        return real(*arguments)
-
-    monkeypatch.setattr(weights, "descend", descend)
-    with pytest.raises(Interrupted) as stop:
+    stop_in_third_run(monkeypatch)
+    with pytest.raises(Interrupted, match="2 of 4 starts") as stop:
         start_at([0.8, 0.0], starts=points)
     assert stop.value.run.start == int(np.nanargmin(found.starts[:2]))
     np.testing.assert_allclose(stop.value.run.starts[:2], found.starts[:2])
