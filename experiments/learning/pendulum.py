@@ -37,7 +37,8 @@ from jaxmpc.mpc import NonlinearMPC, Plan, solve_nonlinear
 @dataclass(frozen=True)
 class Settings:
     """steps: of Adam, each with `batch` new states. rate: its learning rate at first, of logarithms
-    and of r. horizon: steps of a plan. judged: unseen states. tasks: which to learn."""
+    and of r. horizon: steps of a plan. judged: unseen states. tasks: which to learn.
+    rival_steps: of mpc.pytorch, on the same states, if it is installed; 0 for none."""
 
     steps: int = 200
     batch: int = 16
@@ -45,6 +46,7 @@ class Settings:
     horizon: int = 20
     judged: int = 64
     tasks: tuple[str, ...] = ("dynamics", "cost", "both")
+    rival_steps: int = 5
     seed: int = 0
 
 
@@ -119,6 +121,8 @@ def learn(s: Settings, task: str, plan: Callable) -> list[float]:
     random = np.random.default_rng(s.seed)
     own = {name: jnp.asarray(START[name]) for name in LEARNED[task]}
     unseen, rule = draw(random, s.judged), optax.adam(optax.cosine_decay_schedule(s.rate, s.steps))
+    starts = [draw(random, s.batch) for _ in range(s.steps)]
+    lesson = [(x, np.asarray(plan(EXPERT, x).inputs)) for x in starts]
     goal = plan(EXPERT, unseen).inputs
 
     def loss(own: Theta, x: Array, inputs: Array) -> tuple[Array, Array]:
@@ -127,25 +131,96 @@ def learn(s: Settings, task: str, plan: Callable) -> list[float]:
         return jnp.mean((found.inputs - inputs) ** 2, where=use), jnp.mean(found.solved)
 
     @jax.jit
-    def update(own: Theta, state: Any, x: Array, inputs: Array) -> tuple[Theta, Any, Array]:
-        (_, solved), slope = jax.value_and_grad(loss, has_aux=True)(own, x, inputs)
+    def update(own: Theta, state: Any, x: Array, inputs: Array) -> tuple[Theta, Any, Any]:
+        found, slope = jax.value_and_grad(loss, has_aux=True)(own, x, inputs)
         change, state = rule.update(slope, state)
-        return optax.apply_updates(own, change), state, solved
+        return optax.apply_updates(own, change), state, found
 
+    def judge(k: int) -> None:
+        judged.append(float(np.mean((plan(EXPERT | own, unseen).inputs - goal) ** 2)))
+        print(f"  {k:4} loss {judged[-1]:.2e}  {described(own)}", flush=True)
+
+    judged: list[float] = []
     losses, seconds, solved, state = [], [], [], rule.init(own)
-    for k in range(s.steps + 1):
-        if k in {0, 10, 50, 100, s.steps}:
-            losses.append(float(np.mean((plan(EXPERT | own, unseen).inputs - goal) ** 2)))
-            print(f"  {k:4} loss {losses[-1]:.2e}  {described(own)}", flush=True)
-        x = draw(random, s.batch)
-        inputs = plan(EXPERT, x).inputs
+    for k, batch in enumerate(lesson):
+        if k in {0, 10, 50, 100}:
+            judge(k)
         begun = time.perf_counter()
-        own, state, part = jax.block_until_ready(update(own, state, x, inputs))
+        own, state, (value, part) = jax.block_until_ready(update(own, state, *batch))
         seconds.append(time.perf_counter() - begun)
+        losses.append(float(value))
         solved.append(float(part))
-    print(f"  first step {seconds[0]:.1f} s, others {1e3 * np.median(seconds[1:]):.0f} ms; "
+    judge(s.steps)
+    own_step = np.median(seconds[1:])
+    print(f"  first step {seconds[0]:.1f} s, others {1e3 * own_step:.0f} ms; "
           f"{np.mean(solved):.1%} of the plans solved")  # fmt: skip
-    return losses
+    if s.rival_steps:
+        try:
+            found, theirs = mpc_pytorch(s, task, lesson[: s.rival_steps])
+        except ImportError as error:
+            print(f"  mpc.pytorch: left out ({error})")
+            return judged
+        step = np.median(theirs)
+        print(f"  mpc.pytorch: {1e3 * step:.0f} ms a step, {step / own_step:.0f} times")
+        for name, values in (("jaxmpc", losses), ("mpc.pytorch", found)):
+            shown = " ".join(f"{v:.6f}" for v in values[: s.rival_steps])
+            print(f"  {name:12} losses of the batches {shown}", flush=True)
+    return judged
+
+
+def mpc_pytorch(s: Settings, task: str, lesson: list) -> tuple[list[float], list[float]]:
+    """Return the losses of the first steps by mpc.pytorch, and the seconds of each.
+
+    Its last input, which moves no state that has a cost, is the twenty-first.
+    """
+    import torch
+    from mpc import mpc
+
+    torch.set_num_threads(1)
+    tensor = lambda v: torch.tensor(np.asarray(v), dtype=torch.float64)
+    theta = {name: tensor(v) for name, v in EXPERT.items()}
+    own = {name: tensor(START[name]).requires_grad_() for name in LEARNED[task]}
+    rule = torch.optim.Adam(own.values(), lr=s.rate)
+    fall = torch.optim.lr_scheduler.LambdaLR(rule, lambda k: (1 + np.cos(np.pi * k / s.steps)) / 2)
+
+    class Rod(torch.nn.Module):
+        """The pendulum, at (g, mass, length)."""
+
+        def __init__(self, rod: Any) -> None:
+            super().__init__()
+            self.rod = rod
+
+        def forward(self, x: Any, u: Any) -> Any:
+            g, mass, length = self.rod
+            cos, sin, speed = x.unbind(dim=1)
+            turned = 1.5 * g / length * sin + 3 * u[:, 0] / (mass * length**2)
+            speed = speed + DT * turned
+            c, s = torch.cos(DT * speed), torch.sin(DT * speed)
+            return torch.stack([cos * c - sin * s, sin * c + cos * s, speed], dim=1)
+
+    losses, seconds = [], []
+    for x, inputs in lesson:
+        begun = time.perf_counter()
+        at = theta | own
+        weights, count = at["weights"].exp(), s.horizon + 1
+        linear = -weights * torch.cat([at["target"], torch.zeros(1, dtype=torch.float64)])
+        cost = mpc.QuadCost(
+            torch.diag(weights).expand(count, len(x), 4, 4), linear.expand(count, len(x), 4)
+        )
+        solver = mpc.MPC(
+            3, 1, count, u_lower=-TORQUE, u_upper=TORQUE, n_batch=len(x), lqr_iter=100, verbose=-1,
+            grad_method=mpc.GradMethods.AUTO_DIFF, exit_unconverged=False,
+            detach_unconverged=False,
+        )  # fmt: skip
+        _, found, _ = solver(tensor(x), cost, Rod(at["rod"].exp()))
+        loss = torch.mean((found[: s.horizon].transpose(0, 1) - tensor(inputs)) ** 2)
+        rule.zero_grad()
+        loss.backward()
+        rule.step()
+        fall.step()
+        losses.append(loss.item())
+        seconds.append(time.perf_counter() - begun)
+    return losses, seconds
 
 
 def run(s: Settings) -> dict[str, list[float]]:
