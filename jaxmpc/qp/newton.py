@@ -431,7 +431,7 @@ def corrected_end(p: ScaledProgram, s: Refinement) -> Pair:
 
 def proof_steps(most: int) -> int:
     """Return the Newton steps towards a Farkas vector; twice as many towards a ray."""
-    return max(min(most // 5, 30), 1)
+    return max(min(most // 5, 100), 1)
 
 
 def advance(most: int, given: RefinementData, s: Refinement) -> Refinement:

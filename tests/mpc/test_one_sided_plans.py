@@ -9,7 +9,17 @@ from jaxmpc import Status
 
 n, m, N = 2, 2, 4
 # Ends of an interval, in units of its quantity.
-ENDS = [(-1.0, 1.5), (0.0, 1.2), (-0.8, 0.0), (0.0, np.inf), (0.5, 1.5), (-1.2, np.inf)]
+INF = np.inf
+ENDS = [
+    (-1.0, 1.5),
+    (0.0, 1.2),
+    (-0.8, 0.0),
+    (0.0, INF),
+    (0.5, 1.5),
+    (-1.2, INF),
+    (-INF, 1.0),
+    (-INF, -0.2),
+]
 
 
 def draw(rng):
@@ -17,7 +27,7 @@ def draw(rng):
     xs, us = 10.0 ** rng.uniform(-3, 3, n), 10.0 ** rng.uniform(-3, 3, m)
     A = rng.normal(size=(n, n)) if rng.uniform() < 0.5 else rng.uniform(size=(n, n))
     A *= rng.uniform(0.6, 1.1) / np.abs(np.linalg.eigvals(A)).max()
-    x, u, y = (np.array([ENDS[k] for k in rng.integers(6, size=2)]).T for _ in range(3))
+    x, u, y = (np.array([ENDS[k] for k in rng.integers(8, size=2)]).T for _ in range(3))
     C, D = rng.normal(size=(2, n)), rng.normal(size=(2, m))
     mpc = jm.MPC(
         jm.LinearSystem(A * xs[:, None] / xs, rng.normal(size=(n, m)) * xs[:, None] / us, dt=1.0),
@@ -25,7 +35,8 @@ def draw(rng):
         states=jm.Box(*(x * xs)), inputs=jm.Box(*(u * us)), constrain_initial=False,
         outputs=jm.Outputs(C / xs, *y, D=D / us),
     )  # fmt: skip
-    least, most = x[0], np.minimum(x[1], x[0] + 2.5)
+    least = np.where(np.isfinite(x[0]), x[0], x[1] - 2.5)
+    most = np.minimum(x[1], least + 2.5)
     return mpc, xs * (least + (most - least) * rng.uniform(-0.1, 1.1, (32, n)))
 
 
@@ -56,7 +67,7 @@ def room(mpc, x0):
     return -found.fun
 
 
-@pytest.mark.parametrize("seed", range(60))
+@pytest.mark.parametrize("seed", range(40))
 def test_each_plan_is_solved_or_proved_infeasible(seed):
     mpc, x0s = draw(np.random.default_rng(seed))
     plans = jm.solve_many(mpc, x0s)
