@@ -26,6 +26,8 @@ from jaxmpc.sets.lp import FLAT, Optimum, Program, cleaned, power_of_two, scalin
 
 # Tangents of a ball are added to a program up to so often.
 TANGENTS = 200
+# Gain along `outward` beside that of a margin: far above rounding, far below margins that count.
+OUTWARD = 1e-5
 # A point counts as in a ball that it exceeds by no more than this, relative to its radius.
 IN_BALL = 1e-9
 
@@ -323,14 +325,18 @@ class RowPrograms:
         k = self.rows.U.shape[1]
         return found.value, np.zeros(k) if found.x is None else found.x[:k], found.y
 
-    def margin(self, theta: np.ndarray, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def margin(
+        self, theta: np.ndarray, size: np.ndarray, along: np.ndarray | float = 0.0
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return w and the multipliers of the largest s with which all rows at the point θ (d,)
         keep s·size, size (R,) ≥ 0, from their bounds: s < 0 where θ is not feasible.
 
-        Equalities keep no margin, unless nothing feasible is found.
+        Equalities keep no margin, unless nothing feasible is found. along (k,): a gain for moving w
+        that way, beside that of s.
         """
         rows, k = self.rows, self.rows.U.shape[1]
-        U, cost = np.hstack([rows.U, np.zeros((len(rows.U), 1))]), np.append(np.zeros(k), 1.0)
+        U, cost = np.hstack([rows.U, np.zeros((len(rows.U), 1))]), np.ones(k + 1)
+        cost[:k] = along
         most, without = rows.size / size.max(), np.where(self.equalities, 0.0, size)
         for each in [without, size][: 1 + np.any(self.equalities)]:
             found = self.solve_lp(cost, U, rows.D @ theta, most=most, margin=each)
@@ -340,16 +346,25 @@ class RowPrograms:
 
     @cached_property
     def bounding_box(self) -> tuple[np.ndarray | None, np.ndarray]:
-        """Return bounds (2, d) of every feasible θ, lower and upper, None where the set is found
-        empty; and the multipliers (2d, R) of the upper and then the lower sides.
+        """Return bounds (2, d) of every feasible θ, lower and upper, infinite where none is found,
+        None where the set is found empty; and the multipliers (2d, R) of the upper and then the
+        lower sides.
 
         Each side is moved out by the larger of the coordinate's two finite ends, which outweighs
         the tolerances of the linear programs.
         """
         d, programs = self.rows.D.shape[1], RowPrograms(self.rows)
         directions = np.concatenate([np.eye(d), -np.eye(d)])
+
+        def end(direction: np.ndarray) -> tuple[float, np.ndarray]:
+            try:
+                value, _, y = programs.support(direction)
+            except ValueError:  # the linear program has no answer that can be checked
+                return np.inf, np.zeros(len(self.rows.U))
+            return value, y
+
         # Programs of their own, so that no tangent comes from an earlier question.
-        ends, _, y = zip(*(programs.support(row) for row in directions), strict=True)
+        ends, y = zip(*map(end, directions), strict=True)
         if -np.inf in ends:
             return None, np.array(y)
         ends = np.reshape(ends, (2, d))
@@ -384,6 +399,20 @@ class RowPrograms:
         empty, flat = "is empty: no initial state has a plan", "is flat: no initial state keeps"
         what = empty if t < -FLAT else f"{flat} a margin"
         fail("mpc", f"its feasible set {what}", RELAX)
+
+
+def outward(rows: ConstraintRows, inputs: Any) -> np.ndarray:
+    """Return the direction (k,) of w in which inputs with a limit on one side alone move away from
+    it, each as fast as the others, times `OUTWARD`; zero where there are none.
+
+    Such a limit takes up what is left of one sign only. With multipliers of the largest margin
+    nothing is left but rounding, of either sign; beside a gain along this direction something of
+    that sign is, of each such input."""
+    moved = np.asarray(rows.Omega @ rows.back)
+    lower, upper = set_bounds(around(inputs), moved.shape[1])
+    side = np.isinf(upper).astype(float) - np.isinf(lower)
+    length = np.linalg.norm(moved, axis=2, keepdims=True)
+    return OUTWARD * np.einsum("i,kij->j", side, moved / np.where(length > 0, length, 1.0))
 
 
 def _rank(M: np.ndarray) -> int:

@@ -52,7 +52,7 @@ from jaxmpc.batches import (
 )
 from jaxmpc.checks import fail, require_step_type
 from jaxmpc.feasible.candidate_search import compiled_admm, compiled_check, compiled_newton
-from jaxmpc.feasible.condensed_rows import ConstraintRows, RowPrograms
+from jaxmpc.feasible.condensed_rows import ConstraintRows, RowPrograms, outward
 from jaxmpc.feasible.hull_labels import Hull, compiled_verdicts, hull_for
 from jaxmpc.feasible.hull_labels import label as label_by
 from jaxmpc.feasible.problem import FeasibilityProblem
@@ -439,7 +439,7 @@ class Pipeline:
         for rows, program in last_programs(self.problem, self.margins):
             last = last[labels.label[last] == 0]
             for where in self.batches(last):
-                solved = [program(theta) for theta in points[where]]
+                solved = [_candidate(program, rows, theta) for theta in points[where]]
                 candidates = [padded(np.array(v), self.batch) for v in zip(*solved, strict=True)]
                 x = padded(points[where], self.batch)
                 more = self.decided(_run(check, self.exact, rows, x, *candidates)).first(len(where))
@@ -549,8 +549,9 @@ def last_programs(
 
     First the ray from the centre through θ: inside, θ lies between the centre and the ray's end,
     and so do their plans; outside, the end's multipliers are few. Where the plant is unstable the
-    ray again, for multipliers in the units of its growth. Then the largest margin at θ. Tangents to
-    a ball that the programs keep are those of this part's points.
+    ray again, for multipliers in the units of its growth. Then the largest margin at θ, and where
+    inputs have limits on one side the same beside a small gain of `outward`. Tangents to a ball
+    that the programs keep are those of this part's points.
     """
     found = RowPrograms(problem.rows)
     try:
@@ -571,6 +572,20 @@ def last_programs(
         for rows in problem.weighted_rows:
             yield rows, functools.partial(end, RowPrograms(rows))
     yield problem.rows, functools.partial(found.margin, size=margins)
+    along = outward(problem.rows, problem.mpc.inputs) / margins.max()
+    if along.any():
+        yield problem.rows, functools.partial(found.margin, size=margins, along=along)
+
+
+def _candidate(
+    program: LinearProgram, rows: ConstraintRows, theta: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return w and multipliers that a program finds for the point θ, zeros where it has no answer
+    that can be checked."""
+    try:
+        return program(theta)
+    except ValueError:
+        return np.zeros(rows.U.shape[1]), np.zeros(len(rows.U))
 
 
 def labelled_parts(

@@ -75,3 +75,22 @@ def test_each_plan_is_solved_or_proved_infeasible(seed):
     clear = np.abs(rooms) > 1e-5
     expected = np.where(rooms > 0, Status.SOLVED, Status.PRIMAL_INFEASIBLE)
     np.testing.assert_array_equal(plans.status[clear], expected[clear])
+
+
+@pytest.mark.parametrize(
+    "seed", [5, 16, 44, 51, 53, *(pytest.param(k, marks=pytest.mark.slow) for k in range(6, 16))]
+)
+def test_each_state_is_labelled(seed):
+    """Also where no finite box holds the inputs, and multipliers would have to balance exactly."""
+    mpc, x0s = draw(np.random.default_rng(seed))
+    rooms = np.array([room(mpc, x0) for x0 in x0s])
+    clear = np.abs(rooms) > 1e-4
+    label = np.asarray(jm.map_feasible_set(mpc, x0s).label)
+    np.testing.assert_array_equal(label[clear], np.where(rooms > 0, 1, -1)[clear])
+
+
+def test_a_program_without_an_answer_leaves_states_undecided():
+    """Neither HiGHS nor its dual ends one of the programs of this map's bounding box."""
+    mpc, x0s = draw(np.random.default_rng(28))
+    label = np.asarray(jm.map_feasible_set(mpc, x0s).label)
+    assert np.count_nonzero(label) >= 24
