@@ -204,8 +204,8 @@ class PolicyHull:
             )
         rays = PolicyRays.of(problem)
         bounds, left = close_gap(rays, gap, ROUNDS, MOST_RAYS, deadline)
-        unit = np.ptp(bounds.points, axis=0)
         try:
+            unit = np.ptp(bounds.points, axis=0)  # ValueError where there are no points
             facets = hull_facets((bounds.points - rays.center) / unit)
         except (QhullError, ValueError):
             fail("mpc", "its feasible set is flat or unbounded: no hull of policies", "Bound it")

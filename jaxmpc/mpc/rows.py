@@ -184,13 +184,16 @@ def given_blocks(mpc: MPC, dtype: DTypeLike) -> list[Block]:
         box: bool = False,
         **more: Any,
     ) -> None:
+        stages = tuple(stages)
+        if not stages:
+            return
         H, D = (None if M is None else cast(M) for M in (H, D))
         r = (H if D is None else D).shape[-2]
         names, units = texts
         names = tuple(names) or tuple(f"{kind} row {i + 1}" for i in range(r))
         units = tuple(units) or ("",) * r
         lower, upper = map(cast, sides)
-        found.append(Block(kind, H, D, tuple(stages), box, lower, upper, names, units, **more))
+        found.append(Block(kind, H, D, stages, box, lower, upper, names, units, **more))
 
     def add_set(kind: str, limits: Box | Polytope, stages: Iterable[int], texts: tuple) -> None:
         M, *sides = limits.rows()

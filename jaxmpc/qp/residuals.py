@@ -45,6 +45,8 @@ SHARE = 1e-3
 Terms = Sequence[tuple[Array, Array, Array]]
 # Tolerance of a ray's products, in multiples of `rounding`: rays are solutions of linear systems.
 RAY = 25
+# Least size: products of two numbers below it are zero.
+LEAST = float(np.sqrt(np.finfo(np.float64).tiny))
 # Entries of a Farkas vector, relative to the largest in ADMM's coordinates, that count as zero.
 INACTIVE = 1e-13
 # Rows that correct a certificate, and their entries: see `correcting_rows`.
@@ -140,13 +142,16 @@ def terms_of(
 
 def worst(terms: Terms, floor: float | Array) -> tuple[list[Array], list[Array]]:
     """Return of each part the largest residual, each less floor·terms, relative to its size, and
-    the largest relative to size and terms; 0/0 is 0, and inf where one is not finite."""
+    the largest relative to size and terms; 0/0 is 0, and inf where one is not finite.
+
+    Where all is zero at the solution, inputs, rows and multipliers, iterates come to it without
+    end: sizes are no less than `LEAST`."""
     above, relative = [], []
     for values, sizes, own in terms:
         # A maximum need not propagate NaN (XLA on CPUs).
         sound = finite(values) & finite(sizes) & finite(own)
         error = jnp.where(sound, jnp.abs(values), jnp.inf)
-        least = jnp.finfo(error.dtype).tiny
+        least = LEAST if error.dtype == jnp.float64 else jnp.finfo(error.dtype).tiny
         size = jnp.where(sound, jnp.maximum(sizes, least), 1.0)
         total = jnp.where(sound, size + own, 1.0)
         above.append(jnp.max((error - floor * total) / size, initial=0.0))

@@ -78,3 +78,32 @@ def test_wrong_problems_are_named():
     robust = jm.MPC(SYSTEM, np.eye(2), 1.0, 3, jm.Box(-1, 1), disturbance=jm.Box(-0.1, 0.1))
     with pytest.raises(ValueError, match="mpc.disturbance: given"):
         pad_horizon(robust, 5)
+
+
+ONE_STEP = {
+    "states that hold at no stage": {},
+    "terminal set": {"terminal_set": jm.Box([-0.5, -0.5], [0.5, 0.5])},
+    "outputs": {"outputs": jm.Outputs(np.eye(2), [-1.0, -1.0], [1.0, 1.0])},
+    "soft rows": {"soft": jm.Soft(np.eye(2), [-1.0, -1.0], [1.0, 1.0], rho=10.0)},
+    "a rate": {"input_rate_limit": 0.5},
+}
+
+
+@pytest.mark.parametrize("name", ONE_STEP)
+def test_horizons_of_one_step(name):
+    """Inputs that nothing but their own weight moves are zero, and a block of rows may be empty."""
+    system = jm.LinearSystem([[1.0, 0.1], [0.0, 1.0]], [[0.005], [0.1]], dt=0.1)
+    limits = {"states": jm.Box([-1.0, -1.0], [1.0, 1.0]), "inputs": jm.Box(-1, 1)}
+    given = {**limits, "constrain_initial": False, **ONE_STEP[name]}
+    mpc = jm.MPC(system, np.eye(2), 1.0, 1, **given)
+    for solve in (jm.solve, jm.mpc.solve_stagewise):
+        plan = solve(mpc, np.array([0.3, 0.2]))
+        assert plan.status == jm.Status.SOLVED and abs(plan.inputs).max() < 1e-9
+
+
+def test_policies_without_limits_on_states_have_no_map():
+    system = jm.LinearSystem([[1.0, 0.1], [0.0, 1.0]], [[0.005], [0.1]], dt=0.1)
+    few = {"inputs": jm.Box(-1, 1), "disturbance": jm.Box([-0.01] * 2, [0.01] * 2)}
+    mpc = jm.MPC(system, np.eye(2), 1.0, 1, policy="tube", **few)
+    with pytest.raises(ValueError, match="flat or unbounded: no hull of policies"):
+        jm.map_feasible_set(mpc, np.zeros((2, 2)))
