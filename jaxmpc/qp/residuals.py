@@ -45,10 +45,13 @@ SHARE = 1e-3
 Terms = Sequence[tuple[Array, Array, Array]]
 # Tolerance of a ray's products, in multiples of `rounding`: rays are solutions of linear systems.
 RAY = 25
+# Share of the terms of Pz and z'Pz in the sizes of a gradient and a gap that vanish: times eps it
+# is about rounding.
+CANCELS = float(np.sqrt(np.finfo(np.float64).eps))
 # Least size: products of two numbers below it are zero.
 LEAST = float(np.sqrt(np.finfo(np.float64).tiny))
-# Entries of a Farkas vector, relative to the largest in ADMM's coordinates, that count as zero.
-INACTIVE = 1e-13
+# Entries of a Farkas vector or a ray, relative to the largest, that count as zero.
+INSIGNIFICANT = 1e-13
 # Rows that correct a certificate, and their entries: see `correcting_rows`.
 Correcting = tuple[Array, Array]
 
@@ -123,18 +126,19 @@ def terms_of(
     terms = jnp.sum(jnp.abs(z) * (jnp.abs(Pz) + jnp.abs(q)))
     terms = terms + jnp.sum(bounds.slope(Az) * sizes[0] + penalty + jnp.abs(support))
     of_rows = row_sizes(Az, known, typical)
-    # Where bounds hold the solution at zero all sums of the gap vanish.
-    least = typical.gap + jnp.sum(jnp.abs(y) * of_rows)
+    # Where bounds hold the solution at zero, or it has no curvature, all sums of the gap vanish.
+    least = SHARE * (typical.gap + jnp.sum(jnp.abs(y) * of_rows))
+    least = least + CANCELS * jnp.sum(jnp.abs(z) * sizes[1])
     return [
         (bounds.violation(Az), of_rows, sizes[0] + typical.row_terms),
         (
             Pz + q + Aty,
-            abs(Pz) + abs(q) + abs(Aty) + SHARE * typical.variables,
+            abs(Pz) + abs(q) + abs(Aty) + SHARE * typical.variables + CANCELS * sizes[1],
             sizes[1] + abs(q) + sizes[2] + typical.variable_terms,
         ),
         (
             (curved + along + paid + conjugate)[None],
-            (abs(curved) + abs(along) + paid + abs(conjugate) + SHARE * least)[None],
+            (abs(curved) + abs(along) + paid + abs(conjugate) + least)[None],
             terms[None],
         ),
     ]
@@ -277,13 +281,12 @@ def prove(
     """Return what is proved of the program by candidates for a Farkas vector y and a ray d, both in
     ADMM's coordinates (`admm.scale`). correcting: `correcting_rows(qp)`. tolerances (m,): by how
     much rows may be violated. balance: try the vector `balanced`."""
-    ray, unbounded = descent_ray(qp, matmul(d, T.T))
+    ray, unbounded = descent_ray(qp, significant(matmul(d, T.T)))
     if not y.shape[0]:
         return replace(Proof.none(ray, y), ray=ray, unbounded=unbounded)
     # Rows that z cannot move prove emptiness by themselves.
     fixed = jnp.where(E == 0, qp.bounds.violation(jnp.zeros_like(E)), 0.0)
-    # Multipliers that are rounding of others push variables that nothing else pushes.
-    y = jnp.where(jnp.abs(y) > INACTIVE * infinity_norm(y), y, 0.0)
+    y = significant(y)
     y = balanced(qp, E * y) if balance else E * y
     candidate = jnp.where(jnp.any(fixed != 0), fixed, y)
     return Proof(*farkas(qp, candidate, correcting, tolerances), ray, unbounded)
@@ -340,6 +343,12 @@ def farkas(
     bound = jnp.sum(jnp.concatenate([support + gamma * jnp.abs(support), leak]))
     proved, beyond = bound < 0, bound + jnp.sum(tolerances * jnp.abs(y)) < 0
     return jnp.where(proved, y, 0.0), proved, beyond
+
+
+def significant(v: Array) -> Array:
+    """Return v without the entries that are rounding of the largest: those of a multiplier push
+    variables that nothing else pushes, those of a ray move rows that nothing else moves."""
+    return jnp.where(jnp.abs(v) > INSIGNIFICANT * infinity_norm(v), v, 0.0)
 
 
 def balanced(qp: QP, y: Array) -> Array:
