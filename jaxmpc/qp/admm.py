@@ -38,6 +38,7 @@ from jaxmpc.qp.kernel import in_one_program
 from jaxmpc.qp.linalg import cholesky, infinity_norm, inverse_root, matmul, precisely, rounding
 from jaxmpc.qp.problem import FREE, QP, Bounds
 from jaxmpc.qp.residuals import (
+    CANCELS,
     SHARE,
     Measured,
     Pair,
@@ -449,7 +450,7 @@ class ScaledProgram:
         return TypicalSizes(
             rows=primal * f.row_norms,
             variables=dual * per_variable,
-            gap=primal * dual + unit**2 * nearest * gradient,
+            gap=SHARE * primal * dual + CANCELS * unit**2 * nearest * gradient,
             row_terms=terms * f.row_norms,
             variable_terms=unit * gradient * per_variable,
         )

@@ -45,8 +45,8 @@ SHARE = 1e-3
 Terms = Sequence[tuple[Array, Array, Array]]
 # Tolerance of a ray's products, in multiples of `rounding`: rays are solutions of linear systems.
 RAY = 25
-# Share of the terms of Pz and z'Pz in the sizes of a gradient and a gap that vanish: times eps it
-# is about rounding.
+# Share, in the sizes of a gradient and a gap that vanish, of what they are made of: times eps it is
+# about rounding.
 CANCELS = float(np.sqrt(np.finfo(np.float64).eps))
 # Least size: products of two numbers below it are zero.
 LEAST = float(np.sqrt(np.finfo(np.float64).tiny))
@@ -76,8 +76,8 @@ class Products(NamedTuple):
 
 @pytree
 class TypicalSizes:
-    """What is typical of the whole program, for rows (m,), variables (n,) and the gap: sizes, and
-    the terms of rows and variables.
+    """What is typical of the whole program, for rows (m,) and variables (n,): sizes, of which
+    entries have a share, and terms; and the least size of the gap.
 
     In ADMM's coordinates z = T w, in which the Hessian is the identity, the solution is
     w = −q_w − A_w'y: its length is a size, that of q_w one of terms. A row a of scale E = 1/|T'a|
@@ -127,8 +127,8 @@ def terms_of(
     terms = terms + jnp.sum(bounds.slope(Az) * sizes[0] + penalty + jnp.abs(support))
     of_rows = row_sizes(Az, known, typical)
     # Where bounds hold the solution at zero, or it has no curvature, all sums of the gap vanish.
-    least = SHARE * (typical.gap + jnp.sum(jnp.abs(y) * of_rows))
-    least = least + CANCELS * jnp.sum(jnp.abs(z) * sizes[1])
+    vanishing = jnp.sum(jnp.abs(y) * of_rows) + jnp.sum(jnp.abs(z) * sizes[1])
+    least = typical.gap + CANCELS * vanishing
     return [
         (bounds.violation(Az), of_rows, sizes[0] + typical.row_terms),
         (

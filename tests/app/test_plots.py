@@ -253,7 +253,7 @@ def test_robot_map_says_in_words_what_became_of_each_state(claim):
         set_point=np.zeros(2),
         worst=lambda: None,
         seconds=2.0,
-        robot=SimpleNamespace(name="pendulum", dt=0.02),
+        robot=SimpleNamespace(name="pendulum", dt=0.02, time_unit="s"),
     )
     ax = plot_robot_map(rmap)
     counts = {

@@ -1,5 +1,6 @@
 """Plans under limits of one side, at zero and away from it: solved, or proved infeasible."""
 
+import jax
 import numpy as np
 import pytest
 from scipy.optimize import linprog
@@ -94,3 +95,33 @@ def test_a_program_without_an_answer_leaves_states_undecided():
     mpc, x0s = draw(np.random.default_rng(28))
     label = np.asarray(jm.map_feasible_set(mpc, x0s).label)
     assert np.count_nonzero(label) >= 24
+
+
+def positive_systems(count, n, m):
+    """Return stable systems whose states stay positive, and whose inputs are doses."""
+    rng = np.random.default_rng(n)
+    for _ in range(count):
+        A = rng.uniform(0, 1, (n, n))
+        A *= rng.uniform(0.5, 0.95) / np.abs(np.linalg.eigvals(A)).max()
+        yield jm.LinearSystem(A, rng.uniform(0, 1, (n, m)), dt=1.0), rng.uniform(1, 5, (16, n))
+
+
+stagewise = jax.jit(jax.vmap(jm.mpc.solve_stagewise, in_axes=(None, 0)))
+CASES = [(jm.solve_many, 2, 1, 1.0), (stagewise, 2, 1, 1.0), (jm.solve_many, 4, 2, 1e3)]
+CASES += [(stagewise, 3, 2, 1e-3)]
+
+
+@pytest.mark.parametrize(
+    ("solve", "n", "m", "unit"),
+    [CASES[0], *(pytest.param(*case, marks=pytest.mark.slow) for case in CASES[1:])],
+)
+def test_plans_that_dose_nothing(solve, n, m, unit):
+    """With A, B, x0 ≥ 0 every predicted state grows with every input, so does the cost of the
+    states, and the best of all inputs u ≥ 0 is none."""
+    for system, x0s in positive_systems(3, n, m):
+        limits = {"states": jm.Box(np.zeros(n), np.full(n, 20 * unit)), "inputs": jm.Box(0, unit)}
+        mpc = jm.MPC(system, np.eye(n), 0.1 * np.eye(m), 10, terminal_cost=np.eye(n), **limits)
+        with jax.enable_x64(True):
+            plans = solve(mpc, unit * x0s)
+        assert (plans.status == Status.SOLVED).all()
+        assert np.abs(plans.inputs).max() < 1e-9 * unit

@@ -54,14 +54,25 @@ def by_clarabel(P, q, A, l, u):
     return str(found.status), found.obj_val
 
 
+@jax.jit
+@jax.vmap
+def solve(P, q, A, l, u):
+    return jm.solve_qp(jm.QP(P, q, A, l, u))
+
+
+def solved(programs):
+    """Return the solutions of programs of like shapes, in NumPy."""
+    with jax.enable_x64(True):
+        parts = (np.stack(part) for part in zip(*programs, strict=True))
+        return jax.tree.map(np.asarray, solve(*parts))
+
+
 @pytest.mark.parametrize("scaled", [False, True])
-@pytest.mark.parametrize(("n", "m"), [(4, 6), (8, 5)])
+@pytest.mark.parametrize(("n", "m"), [(4, 6), pytest.param(8, 5, marks=pytest.mark.slow)])
 def test_random_programs(n, m, scaled):
     rng = np.random.default_rng(5)
     programs = [draw(rng, n, m, scaled) for _ in range(96)]
-    with jax.enable_x64(True):
-        batch = jm.QP(*(np.stack(part) for part in zip(*programs, strict=True)))
-        found = jax.tree.map(np.asarray, jax.jit(jax.vmap(jm.solve_qp))(batch))
+    found = solved(programs)
     counts = dict.fromkeys(EXPECTED, 0)
     for program, status, cost in zip(programs, found.status, found.cost, strict=True):
         kind, value = by_clarabel(*program)
@@ -70,3 +81,21 @@ def test_random_programs(n, m, scaled):
             assert status in EXPECTED[kind], (kind, counts)
             assert kind != "Solved" or abs(cost - value) <= 1e-6 * abs(value) + 1e-8
     assert min(counts["Solved"], counts["DualInfeasible"]) >= 8, counts
+
+
+@pytest.mark.parametrize(("upper", "cost"), [(np.inf, 1e-3), (3.0, 1.0), (np.inf, 1e4)])
+def test_programs_with_their_solution_at_zero(upper, cost):
+    """z = 0 is optimal for 0 ≤ Az ≤ u where Pz + q + A'y = 0 with y ≤ 0, that is q = −A'y: every
+    size of the pair vanishes there but the multipliers."""
+    rng, n, m = np.random.default_rng(7), 4, 6
+
+    def program():
+        M = rng.normal(size=(n, n))
+        A = np.vstack([np.eye(n), rng.normal(size=(2, n))]) * 10.0 ** rng.uniform(-2, 2, (m, 1))
+        y = np.where(np.arange(m) < n, -rng.uniform(0.1, 1, m), 0.0)
+        P, ends = cost * (M @ M.T + 0.1 * np.eye(n)), (np.zeros(m), np.full(m, upper))
+        return P, -cost * A.T @ y, A, *ends
+
+    found = solved([program() for _ in range(96)])
+    assert (found.status == Status.SOLVED).all()
+    assert np.abs(found.z).max() < 1e-9
