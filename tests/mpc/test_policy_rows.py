@@ -195,7 +195,7 @@ def least_first_inputs(mpc: jm.MPC, states: np.ndarray) -> np.ndarray:
     return np.array(least)
 
 
-@pytest.mark.parametrize("policy", ["affine", "tube"])
+@pytest.mark.parametrize("policy", ["tube", pytest.param("affine", marks=pytest.mark.slow)])
 def test_without_limits_the_nominal_inputs_are_those_of_the_lqr(policy):
     mpc = robust(policy, terminal_set=None)
     found = plans(replace(mpc, states=None, inputs=None), STATES[:2])
