@@ -832,7 +832,8 @@ def test_few_and_many_active_rows_in_a_batch():
     weights[1, :3] = rng.uniform(0.1, 0.9, 3)
     a, c = rng.standard_normal((len(counts), n)), rng.standard_normal((len(counts), m))
     with jax.enable_x64(True):
-        move = lambda D, a, c: linearised(H, A, D, [], rho, jnp.asarray(False))(a, c)
+        given = jnp.asarray(H), jnp.asarray(A)
+        move = lambda D, a, c: linearised(*given, D, [], rho, jnp.asarray(False))(a, c)
         dw, dy = jax.vmap(move)(*map(jnp.asarray, (weights, a, c)))
         for i, D in enumerate(weights):
             whole = np.block([[H, A.T], [D[:, None] * A, np.diag((D - 1) / rho)]])
@@ -843,6 +844,6 @@ def test_few_and_many_active_rows_in_a_batch():
         twice = weights[1] + (np.arange(m) == 3) + (np.arange(m) == 7)
         once = weights[1] + (np.arange(m) == 3)
         c = np.where(np.isin(np.arange(m), (3, 7)), 0.0, c[1])
-        (w_2, y_2), (w_1, y_1) = (move(jnp.asarray(D), a[1], c) for D in (twice, once))
+        (w_2, y_2), (w_1, y_1) = (move(*map(jnp.asarray, (D, a[1], c))) for D in (twice, once))
         np.testing.assert_allclose(w_2, w_1, atol=1e-6)
         np.testing.assert_allclose(y_2[3] + y_2[7], y_1[3], rtol=1e-6, atol=1e-6)
