@@ -77,12 +77,7 @@ def inverse_task(s: Settings, name: str) -> tuple[tuple, dict[str, Any]]:
 def masses_task(s: Settings) -> tuple[tuple, dict[str, Any]]:
     """Return those of the task of useful.py."""
     given = useful.Settings(spread=s.spread, seed=s.seed)
-    robot = jm.load_robot(given.robot)
-    nv = robot.mujoco.nv
-    speed = given.velocity * np.asarray(robot.state_limits.upper)[nv:]
-    robot = jm.load_robot(given.robot, velocity=(-speed, speed))
-    x, u = robot.equilibrium()
-    aims = {"reference": np.asarray(robot.coordinates(x)), "input_reference": u}
+    robot, aims = useful.robot_at_rest(given)
     guess, make = useful.law(given, robot)
     loss = jm.ClosedLoopLoss(
         guess["q"],

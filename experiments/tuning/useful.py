@@ -115,14 +115,20 @@ def law(s: Settings, robot: Robot) -> tuple[dict, Callable, jm.ADMM]:
     return {"q": np.diag(mpc.Q), "r": np.diag(mpc.R)}, make
 
 
+def robot_at_rest(s: Settings) -> tuple[Robot, dict[str, np.ndarray]]:
+    """The robot with its limits of velocity, and the set-point where it rests, by the arguments of
+    a loop."""
+    robot = jm.load_robot(s.robot)
+    speed = s.velocity * np.asarray(robot.state_limits.upper)[robot.mujoco.nv :]
+    robot = jm.load_robot(s.robot, velocity=(-speed, speed))
+    x, u = robot.equilibrium()
+    return robot, {"reference": np.asarray(robot.coordinates(x)), "input_reference": u}
+
+
 def run(s: Settings) -> None:
     """Tune, search for as long, judge all on the same unseen robots."""
-    robot = jm.load_robot(s.robot)
+    robot, aims = robot_at_rest(s)
     nv = robot.mujoco.nv
-    speed = s.velocity * np.asarray(robot.state_limits.upper)[nv:]
-    robot = jm.load_robot(s.robot, velocity=(-speed, speed))
-    x_ref, u_ref = robot.equilibrium()
-    aims = {"reference": np.asarray(robot.coordinates(x_ref)), "input_reference": u_ref}
     late = {"delay": s.delay, "compensate": False}
     guess, make = law(s, robot)
     loss = ClosedLoopLoss(

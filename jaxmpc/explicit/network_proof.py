@@ -22,7 +22,7 @@ from jaxmpc.checks import fail, require_finite, require_kind, require_shape, who
 from jaxmpc.pytrees import record
 from jaxmpc.sets.convex_sets import Box
 from jaxmpc.sets.linear_sets import LinearSet, as_polytope
-from jaxmpc.sets.polyhedra import TRIANGULATED, triangulation
+from jaxmpc.sets.polyhedra import TRIANGULATED, simplex_volumes, triangulation
 from jaxmpc.systems.system import LinearSystem, host_matrices
 
 # Simplices that a program takes at once.
@@ -115,18 +115,18 @@ def prove_network(
         margin = MARGIN + rounding_bound((layers, (low, high), last), np.abs(vertices).max(axis=0))
         network64 = jax.tree.map(jnp.asarray, (layers, (low, high), last))
         bounds = jax.jit(jax.vmap(excess_bounds, (None, 0)))
-        whole_volume, kept, broken, count = float(_volumes(left).sum()), 0.0, 0.0, 0
+        whole_volume, kept, broken, count = float(simplex_volumes(left).sum()), 0.0, 0.0, 0
         while len(left) and count + len(left) <= cells:
             room = -len(left) % PART
             padded = np.concatenate([left, np.repeat(left[:1], room, axis=0)])
             parts = [bounds(network64, padded[i : i + PART]) for i in range(0, len(padded), PART)]
             least, most = (np.concatenate(v)[: len(left)] for v in zip(*parts, strict=True))
             count += len(left)
-            volume, proved, refuted = _volumes(left), most <= -margin, least >= margin
+            volume, proved, refuted = simplex_volumes(left), most <= -margin, least >= margin
             kept += float(volume[proved].sum())
             broken += float(volume[refuted].sum())
             left = _halves(left[~proved & ~refuted], size)
-    undecided = float(_volumes(left).sum())
+    undecided = float(simplex_volumes(left).sum())
     return NetworkProof(
         kept / whole_volume, broken / whole_volume, undecided / whole_volume, count, left
     )
@@ -209,11 +209,6 @@ def _checked(network: Any, n: int, m: int) -> list[tuple[np.ndarray, np.ndarray]
     if units != m:
         fail("network", f"has {units} outputs for {m} inputs", "One row of the last W an input")
     return layers
-
-
-def _volumes(corners: np.ndarray) -> np.ndarray:
-    """Return the volumes (K,) of simplices (K, n+1, n), up to the factor n!."""
-    return np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1]))
 
 
 def _halves(corners: np.ndarray, size: np.ndarray) -> np.ndarray:

@@ -220,6 +220,11 @@ def triangulation(vertices: np.ndarray) -> np.ndarray:
         return vertices[Delaunay(scaled, qhull_options="QJ").simplices]
 
 
+def simplex_volumes(simplices: np.ndarray) -> np.ndarray:
+    """Return the volumes (K,) of simplices (K, k+1, k), times k!."""
+    return np.abs(np.linalg.det(simplices[:, 1:] - simplices[:, :1]))
+
+
 def spread(vertices: np.ndarray, count: int, random: np.random.Generator) -> np.ndarray:
     """Return points (count, k) uniformly distributed over the hull of vertices that span R^k: a
     simplex of a triangulation by its volume, then a point in it."""
@@ -231,7 +236,7 @@ def spread(vertices: np.ndarray, count: int, random: np.random.Generator) -> np.
         fail("sample", problem, "Draw from bounding_box() and keep what the set contains")
     center, scale = vertices.mean(axis=0), np.ptp(vertices, axis=0)
     simplices = (triangulation(vertices) - center) / scale
-    size = np.abs(np.linalg.det(simplices[:, 1:] - simplices[:, :1]))
+    size = simplex_volumes(simplices)
     which = random.choice(len(size), count, p=size / size.sum())
     weights = random.dirichlet(np.ones(k + 1), count)
     return center + scale * np.einsum("ij,ijk->ik", weights, simplices[which])

@@ -188,8 +188,7 @@ class Interrupted(KeyboardInterrupt):
 
     run: the `TuningRun` of the steps that were done, with the best of them as its result; of
     `trade_off` the `TradeOff` of the points that were begun. done: what was done, for the message;
-    None: the steps of the run. As a KeyboardInterrupt it ends a
-    program that does not catch it.
+    None: the steps of the run. As a KeyboardInterrupt it ends a program that does not catch it.
     """
 
     def __init__(self, run: Any, done: str | None = None) -> None:
