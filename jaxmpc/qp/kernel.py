@@ -294,8 +294,9 @@ def _lowered_by_triton(*args: Array, kernel: Kernel, batched: tuple, batch: tupl
         return _each(partial(_by_pallas, kernel), batched, batch)(*args)
     import jax_triton
 
-    # Newer versions have another name for the types of the results.
-    names = jax_triton.triton_call.__kwdefaults__
+    # Newer versions have other names for the types of the results and for options of the compiler,
+    # which from Triton 3.10 on contracts no products and sums where it is not told to.
+    names, fused = jax_triton.triton_call.__kwdefaults__, {"enable_fp_fusion": True}
     with jax.enable_x64(True):  # what is lowered outside 64-bit mode may have been traced in it
         return jax_triton.triton_call(
             *args,
@@ -306,6 +307,7 @@ def _lowered_by_triton(*args: Array, kernel: Kernel, batched: tuple, batch: tupl
             num_stages=1,
             input_output_aliases=dict(kernel.aliases),
             **{"out_type" if "out_type" in names else "out_shape": shapes},
+            **({"backend_options": fused} if "backend_options" in names else fused),
         )
 
 
