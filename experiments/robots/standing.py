@@ -212,9 +212,8 @@ def main() -> None:
     print(f"MPC simulated in {time.perf_counter() - began:.0f} s, compiling included", flush=True)
     stands, solved = stood(run.states), run.status == jm.Status.SOLVED
     report("MPC", ratio, stands)
-    print(
-        f"plans solved {solved.mean():.3%}; violating a cone or limit {run.fallback.mean():.3%}, "
-    )
+    print(f"plans solved {solved.mean():.3%}, of robots that stood {solved[stands].mean():.3%}; ")
+    print(f"violating a cone or limit {run.fallback.mean():.3%}, ", end="")
     print(f"of those of robots that stood {run.fallback[stands].mean():.3%}")
     chosen = np.flatnonzero(stands)[:64]
     normal, share, error = of_feet(robot, jax.tree.map(lambda v: v[chosen], run))
