@@ -287,13 +287,25 @@ def dual_search(
     Where `steps.first` do not get there, multipliers exceed the limit, or rows that join singly are
     too many for W, it begins once more from `cold`, the point without multipliers, with rows that
     join singly."""
+    none, constants, every = jnp.int32(0), (dual, cold), min(*dual.A.shape)
     if has_kernels(len(dual.S)):
-        return dual_search_kernel(dual, cold, point, jnp.int32(0), go_on, steps)
-    state = DualSearch(point, jnp.int32(0), go_on, jnp.asarray(False))
-    most = most_rows(dual.A)
-    step = partial(_search_step, steps, most)
-    first = partial(_first_step, steps, min(most, FIRST_ROWS))
-    end = repeat_while(lambda s: s.open, step, (dual, cold), state, first=first)
+        most = min(every, KERNEL_ROWS)
+        point, optimal = dual_search_kernel(dual, cold, point, none, go_on, steps)
+    else:
+        most = min(every, MOST_ROWS)
+        state = DualSearch(point, none, go_on, jnp.asarray(False))
+        step = partial(_search_step, steps, most)
+        first = partial(_first_step, steps, min(most, FIRST_ROWS))
+        end = repeat_while(lambda s: s.open, step, constants, state, first=first)
+        point, optimal = end.point, end.optimal
+    if most == every:
+        return point, optimal
+    # Those with more rows in W have been left as they were.
+    in_W = working_set(dual.bounds, point.y, point.v, jnp.asarray(False))
+    large = (jnp.sum(in_W) > most) & (infinity_norm(point.y) <= dual.limit)
+    state = DualSearch(point, none, go_on & ~optimal & large, optimal)
+    step = partial(_search_step, steps, every)
+    end = repeat_while(lambda s: s.open, step, constants, state, steps="long")
     return end.point, end.optimal
 
 
@@ -318,13 +330,20 @@ def _first_step(
 def _search_step(
     steps: MostSteps, most: int, constants: tuple[Dual, DualPoint], s: DualSearch
 ) -> DualSearch:
+    """Return the state after a step with `most` rows in W. Where W has more, and could have, the
+    point stays and the search ends; where it has as many as it can, rows join jointly for longer."""
     dual, cold = constants
+    every = min(*dual.A.shape)
+    jointly = JOINTLY if most <= MOST_ROWS else steps.first
     again = s.steps == steps.first
     point = tree_where(again, cold, s.point)
-    point, fits = dual_step(dual, point, again | (s.steps >= JOINTLY), most)
+    point, fits = dual_step(dual, point, again | (s.steps >= jointly), most)
     largest = [jnp.max(v, initial=0.0) for v in sizes(dual.bounds, point.y, point.v)]
     after = after_step(largest, CONVERGED, dual.limit, s.steps + 1, fits, steps)
-    return DualSearch(point, *after)
+    new = DualSearch(point, *after)
+    if most == every:
+        return new
+    return tree_where(fits, new, replace(s, open=jnp.asarray(False)))
 
 
 def has_dual_steps(balls: tuple[int, ...], A: Array) -> bool:
@@ -397,7 +416,8 @@ def dual_search_kernel(
     flags = jnp.stack([taken, go_on.astype(jnp.int32), jnp.int32(0)])
     y, v = point.y, point.v
     for side in sides(rows):
-        search = _search(dual, min(side, rows), side, steps, last=side >= rows)
+        last = side >= rows == min(*dual.A.shape)
+        search = _search(dual, min(side, rows), side, steps, last=last)
         y, v, flags = search(dual.limit, cold.v, flags, y, v)
     # A search that began again has other multipliers, all of which count from the cold point.
     again = flags[0] > steps.first
