@@ -15,7 +15,9 @@ symmetric system of static size. y + t d, with rows that would change sign stopp
 tried for several t, among them the largest that stops no row; the one with the best dual value is
 taken. So the dual value rises at each step; where the guess of W was right one step is exact. All
 violated rows join W at first; where that does not end soon, one at a time, as in the dual method
-of Goldfarb and Idnani (1983).
+of Goldfarb and Idnani (1983). The few instances whose W is large go on by themselves, with systems
+as large as W can be (random programs with 50 to 119 of 120 inputs at their limits take 8 steps in
+which all violated rows join, 20 if they do so twice only).
 Where H is not the identity (P singular) or there are balls, nothing is done here.
 
 The search is a loop of XLA, or on NVIDIA GPUs one kernel (end of this file), made of the same
@@ -331,7 +333,7 @@ def _search_step(
     steps: MostSteps, most: int, constants: tuple[Dual, DualPoint], s: DualSearch
 ) -> DualSearch:
     """Return the state after a step with `most` rows in W. Where W has more, and could have, the
-    point stays and the search ends; where it has as many as it can, rows join jointly for longer."""
+    point stays and the search ends. In systems of all sizes rows join jointly for longer."""
     dual, cold = constants
     every = min(*dual.A.shape)
     jointly = JOINTLY if most <= MOST_ROWS else steps.first

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import jaxmpc as jm
+from jaxmpc.__main__ import session
 from jaxmpc.app import program_cache
 from jaxmpc.app.commands import compile_notice
 from jaxmpc.app.commands.compile_notice import Compiling
@@ -199,3 +200,12 @@ def test_results_are_the_same_with_and_without():
         (folder / f"{path.stem}.{zlib.crc32(b'nothing'):08x}").write_bytes(b"nothing")
         path.unlink()
     assert finish(start()) == (False, values)
+
+
+def test_a_command_has_one_thread_of_openblas_unless_another_count_is_given(monkeypatch):
+    for given, wanted in ((None, "1"), ("3", "3")):
+        monkeypatch.delenv("OPENBLAS_NUM_THREADS")
+        if given:
+            monkeypatch.setenv("OPENBLAS_NUM_THREADS", given)
+        with session(["info"]):
+            assert os.environ["OPENBLAS_NUM_THREADS"] == wanted
