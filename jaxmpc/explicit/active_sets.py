@@ -55,6 +55,8 @@ from jaxmpc.sets.lp import (
     scaling,
 )
 
+# Curvature of the cost, relative to its terms, up to which it counts as none.
+SINGULAR = 1e-12
 # In coordinates where X_N just fits into [−1, 1]^n: the smallest ball of a region.
 SMALLEST = 1e-9
 # Rows of length 1 closer to the span of others than this count as dependent on them.
@@ -443,14 +445,17 @@ def least_distance_form(
         fail(name, f"{flat}, as equalities tie the states to each other", "Relax one of them")
     # z = shift + S x + N w
     N, S, shift_z = hull.basis[n:, n:], hull.basis[n:, :n], hull.shift[n:]
-    try:
-        factor = np.linalg.cholesky(N.T @ given.P @ N)
-    except np.linalg.LinAlgError:
+    curvature, terms = N.T @ given.P @ N, np.diag(np.abs(N).T @ np.abs(given.P) @ np.abs(N))
+    unit = 1 / np.sqrt(np.where(terms > 0, terms, 1.0))
+    # Rounding decides whether a singular matrix has a Cholesky factor.
+    least = np.linalg.eigvalsh(unit[:, None] * curvature * unit).min(initial=1.0)
+    if least <= SINGULAR:
         if mpc:
             what = "leaves the condensed cost singular in float64"
             fail("R", what, "Put a larger weight on inputs")
         what = "is singular in float64 where rows leave z free: the optimum is not unique"
         fail("P", what, "Add a small multiple of the unit matrix")
+    factor = np.linalg.cholesky(curvature)
     G, V, v = hull.G[:, n:], -hull.G[:, :n], hull.g
     row, side = given.row[hull.rows], given.side[hull.rows]
 

@@ -255,6 +255,19 @@ class TestOfAnMPC:
         assert regions.complete, regions.reason
 
 
+def test_costs_that_are_singular_but_for_rounding_are_refused():
+    """P = MM' with fewer columns than rows leaves z open along M'z = 0; of its rounded entries a
+    Cholesky factor may exist."""
+    rng = np.random.default_rng(0)
+    for n in (2, 3, 4):
+        for k in range(1, n):
+            for _ in range(10):
+                M = rng.normal(size=(n, k)) * 10.0 ** rng.uniform(-2, 2, (n, 1))
+                qp = ParametricQP(M @ M.T, np.ones((1, n)), [1.0], F=rng.normal(size=(n, 1)))
+                with pytest.raises(ValueError, match="P: is singular"):
+                    critical_regions(qp, jm.Box([-1], [1]))
+
+
 def test_errors():
     qp = ParametricQP(np.eye(2), np.eye(2), [1.0, 1.0], S=np.ones((2, 1)))
     box = jm.Box([-1], [1])

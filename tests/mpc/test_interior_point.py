@@ -1,4 +1,6 @@
-"""The interior point method stage by stage where its steps used to become short."""
+"""The interior point method stage by stage where its steps used to become short or to lead nowhere."""
+
+from dataclasses import replace
 
 import cvxpy as cp
 import jax
@@ -44,3 +46,27 @@ def test_plans_from_far_outside_soft_limits_are_solved():
     assert np.all(plan.status == jm.Status.SOLVED)
     for x0, cost in zip(x0s, plan.cost, strict=True):
         np.testing.assert_allclose(cost, least_cost(soft, x0), rtol=1e-6)
+
+
+def test_soft_rows_without_a_penalty_are_no_rows():
+    """A multiplier z with 0 < z < ρ does not exist for ρ = 0: the interior point method had no
+    interior. Beside the same problem without such rows."""
+    rng, N, count = np.random.default_rng(0), 4, 64
+    solve = lambda mpc, x: jm.mpc.solve_stagewise(mpc, x, solver=jm.ADMM(iterations=0))
+    solve = jax.jit(jax.vmap(solve))
+    problems = []
+    for _ in range(count):
+        system = jm.LinearSystem(0.5 * rng.normal(size=(3, 3)), rng.normal(size=(3, 2)), dt=1.0)
+        rho = rng.choice([0.0, 0.5, 2.0], 4)
+        soft = jm.Soft(rng.normal(size=(4, 3)), -0.2 * np.ones(4), 0.1 * np.ones(4), rho=rho)
+        inputs = jm.Box(-0.2 * np.ones(2), 0.3 * np.ones(2))
+        mpc = jm.MPC(system, np.eye(3), 0.1 * np.eye(2), N, inputs=inputs, soft=soft)
+        free = np.where(rho > 0, 0.1, np.inf)
+        without = replace(mpc, soft=(replace(soft, lower=np.minimum(-0.2, -free), upper=free),))
+        problems.append((mpc, without))
+    stacked = jax.tree.map(lambda *v: np.stack(v), *(jax.tree.map(np.asarray, p) for p in problems))
+    x0s = rng.normal(size=(count, 3))
+    with jax.enable_x64(True):
+        plans, others = (solve(mpcs, x0s) for mpcs in stacked)
+    assert np.all(plans.status == jm.Status.SOLVED) and np.all(others.status == jm.Status.SOLVED)
+    np.testing.assert_allclose(plans.cost, others.cost, rtol=1e-7)

@@ -157,8 +157,9 @@ class Limits(NamedTuple):
         c, k = jnp.ones_like(bounds.u), jnp.zeros_like(bounds.u)
         if bounds.linear is not None:
             finite = jnp.isfinite(bounds.linear)
-            soft = present & finite
             c, k = jnp.where(finite, bounds.linear, c), jnp.where(finite, bounds.quadratic, k)
+            present &= (c > 0) | (k > 0)  # with no penalty 0 < z < c + k e holds nowhere
+            soft = present & finite
         sign = jnp.array([[1.0], [-1.0]], b.dtype)
         return cls(sign, jnp.where(present, b, 0.0), present, soft, c, k)
 
@@ -230,7 +231,7 @@ def newton_search_step(most: int, constants: tuple, state: SearchState) -> Searc
     """
     s, E, rho, eps = constants
     u, y = stage_newton_step(s, E, rho, state.u, state.dual)
-    best, steps = state.best.or_better(measured_pair(eps, s, u, y)), state.steps + 1
+    best, steps = state.best.or_better(measured_pair(eps, s, E, u, y)), state.steps + 1
     return SearchState(u, y, best, steps, ~(best.near | best.finished) & (steps < most))
 
 
@@ -281,7 +282,7 @@ def interior_step(most: int, constants: tuple, state: SearchState) -> SearchStat
     at = jax.tree.map(lambda a, b: jnp.where(first, a, b), begun, at)
     y = s.bounds.admissible(fixed + E * limits.multipliers(at))
     found = conditions(s, u, y)
-    pair = Pair.of(u, y, residuals_of(s, u, y, found), eps, rounding(u.dtype))
+    pair = Pair.of(u, y, residuals_of(s, E, u, y, found), eps, rounding(u.dtype))
     again = pair.measured.within_tolerance & state.best.measured.within_tolerance
     best, steps = state.best.or_better(pair), state.steps + 1
     lost = (least < BEGUN) & (pair.error > LOST * least)

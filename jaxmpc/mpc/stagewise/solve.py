@@ -298,7 +298,7 @@ def stage_solution(
     none = Proof.none(u, y)
     if measured is not None:
         return with_status(measured, u, y, none)
-    return assess(stage_residuals, (s,), u, y, none, tolerance(solver, u.dtype))
+    return assess(stage_residuals, (s, factor.E), u, y, none, tolerance(solver, u.dtype))
 
 
 def searched(
@@ -355,7 +355,7 @@ def refined(
     def go_on(best: Pair, first: Array) -> tuple[Pair, None]:
         return search.from_pair(s, E, rho, fixed, eps, best, first), None
 
-    best = measured_pair(eps, s, u, y)
+    best = measured_pair(eps, s, E, u, y)
     # Weights of rows that are held grow until rounding stops the interior point method; Newton's
     # are bounded. As a loop, so that both are compiled once.
     rounds = jnp.arange(2 if search.interior else 1) == 0

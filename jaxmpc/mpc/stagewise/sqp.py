@@ -201,7 +201,7 @@ def _solve(
     else:
         at_solution = jax.lax.stop_gradient((E, rho, base, problem))
         u, y = implicit(nonlinear_conditions, s, at_solution, u, y)
-        found = assess(nonlinear_residuals, (s,), u, y, Proof.none(u, y), eps)
+        found = assess(nonlinear_residuals, (s, E), u, y, Proof.none(u, y), eps)
     found = replace(found, iterations=jnp.asarray(count, jnp.int32))
     x, u = predict(s, found.z), found.z
     plan = answer(mpc, s.layout, found, fault, s.of_system(x), u, aim)
@@ -335,10 +335,10 @@ def defects(s: Stages, x: Array, u: Array) -> tuple[Array, Array, Array]:
     return parts[0] + parts[1] + parts[2] - x[1:], sizes, terms
 
 
-def nonlinear_residuals(s: Stages, u: Array, y: Array) -> Terms:
+def nonlinear_residuals(s: Stages, E: Array, u: Array, y: Array) -> Terms:
     """Return the residuals of the nonlinear problem at the point of expansion: those of the
     expansion, with the defects among the rows."""
-    of_rows, *rest = stage_residuals(s, u, y)
+    of_rows, *rest = stage_residuals(s, E, u, y)
     of_defects = defects(s, s.aim.states, u)
     joined = [jnp.concatenate([a, b.ravel()]) for a, b in zip(of_rows, of_defects, strict=True)]
     return [(joined[0], joined[1], joined[2]), *rest]
@@ -390,9 +390,10 @@ def sqp_step(most: int, hessian: str, constants: tuple, state: Iterate) -> Itera
     x, u, y = state.x, state.u, state.y
     s = expanded(base, problem, x, u)
     y = s.bounds.admissible(y)
-    measure = lambda s, u, y, eps: Measured.of(nonlinear_residuals(s, u, y), eps, rounding(x.dtype))
-    solved = precisely(measure, s, u, y, eps / 10).within_tolerance
     E, rho = scales(s, scale)
+    residuals, floor = nonlinear_residuals, rounding(x.dtype)
+    measure = lambda s, E, u, y, eps: Measured.of(residuals(s, E, u, y), eps, floor)
+    solved = precisely(measure, s, E, u, y, eps / 10).within_tolerance
     exact = jnp.asarray(False)
     if hessian == "exact":
         bent = curved(s, base, problem, x, u, costates(s, u, y), y)
@@ -476,7 +477,7 @@ def solved_qp(
         return jax.lax.while_loop(is_open, step, varying(state, (state, constants)))
 
     search = Search(NEWTON_STEPS, INTERIOR_STEPS, loop)
-    best = search.from_pair(s, E, rho, fixed, eps, measured_pair(eps, s, u, y), ~exact)
+    best = search.from_pair(s, E, rho, fixed, eps, measured_pair(eps, s, E, u, y), ~exact)
     return best.z, best.y, best.measured.within_tolerance
 
 

@@ -294,12 +294,13 @@ def unconstrained(s: Stages, gains: Gains, weights: Array) -> tuple[Array, Array
 
 class Optimality(NamedTuple):
     """Rows (rows,) and gradient (N, m) of the Lagrangian with respect to the inputs, the terms of
-    both, and the sums that the gradient is a difference of."""
+    both and of the cost, and the sums that the gradient is a difference of."""
 
     rows: Array
     gradient: Array
     row_terms: Array
     gradient_terms: Array
+    cost_terms: Array
     gradient_size: Array
 
 
@@ -332,28 +333,33 @@ def conditions(s: Stages, u: Array, y: Array) -> Optimality:
         gradient_terms=own_terms
         + absolute.pull(jnp.abs(y))[1]
         + apply_transposed(absolute.B, back_terms),
+        cost_terms=(jnp.sum(terms * weighed) + jnp.sum(jnp.abs(u) * own_terms)) / 2,
         gradient_size=cost_part + row_part,
     )
 
 
-def stage_residuals(s: Stages, u: Array, y: Array) -> Terms:
-    """As `qp.residuals.residual_terms`, for the condensed QP in the inputs."""
-    return residuals_of(s, u, y, conditions(s, u, y))
+def stage_residuals(s: Stages, E: Array, u: Array, y: Array) -> Terms:
+    """As `qp.residuals.residual_terms`, for the condensed QP in the inputs; E: row scale (rows,)."""
+    return residuals_of(s, E, u, y, conditions(s, u, y))
 
 
-def residuals_of(s: Stages, u: Array, y: Array, found: Optimality) -> Terms:
+def residuals_of(s: Stages, E: Array, u: Array, y: Array, found: Optimality) -> Terms:
     """Return `stage_residuals` of a pair whose conditions are known.
 
     With the gradient g of the Lagrangian the gap z'Pz + q'z + g(Az) + g*(y) is
     u'g + g(rows) + g*(y) − y'rows: at the optimum both parts are zero. What is typical of a row
-    and of an input is what is the most of the same one over the horizon.
+    and of an input is what is the most of the same one over the horizon. All that may vanish, as
+    where u = 0 is all that limits allow: inputs that cost as much as the plan, J ≤ ½ c, move a row
+    of scale E by up to √c/E, and steps that end at a limit leave rounding of that.
     """
     bounds = s.bounds
+    reach = jnp.where(E > 0, jnp.sqrt(2 * found.cost_terms) / jnp.where(E > 0, E, 1.0), 0.0)
+    own_terms = found.row_terms + reach
     penalty, support, product = bounds.cost(found.rows), bounds.support(y), y * found.rows
     gap = jnp.sum(u * found.gradient) + jnp.sum(penalty + support - product)
     terms = jnp.sum(jnp.abs(u) * found.gradient_terms)
     slopes = bounds.slope(found.rows) + jnp.abs(y)
-    terms = terms + jnp.sum(slopes * found.row_terms + jnp.abs(support))
+    terms = terms + jnp.sum(slopes * own_terms + jnp.abs(support))
     size = jnp.sum(penalty + jnp.abs(support) + jnp.abs(product))
     size = size + jnp.sum(jnp.abs(u) * found.gradient_size)
 
@@ -364,7 +370,7 @@ def residuals_of(s: Stages, u: Array, y: Array, found: Optimality) -> Terms:
         return jnp.concatenate([*(jnp.broadcast_to(m, p.shape).ravel() for p, m in pairs), v[:0]])
 
     row_size = jnp.maximum(bounds.sizes(), jnp.abs(found.rows))
-    row_terms = found.row_terms + row_size
+    row_terms = own_terms + row_size
     gradient_size = found.gradient_size + SHARE * jnp.max(found.gradient_size, axis=0)
     gradient_terms = found.gradient_terms + jnp.max(found.gradient_terms, axis=0)
     row_sizes = row_size + SHARE * most(row_size)
@@ -377,8 +383,9 @@ def residuals_of(s: Stages, u: Array, y: Array, found: Optimality) -> Terms:
     ]
 
 
-def measured_pair(eps: Array, s: Stages, u: Array, y: Array) -> Pair:
-    """The pair of inputs u (N, m) and multipliers y (rows,), its residuals measured in float64."""
+def measured_pair(eps: Array, s: Stages, E: Array, u: Array, y: Array) -> Pair:
+    """The pair of inputs u (N, m) and multipliers y (rows,), its residuals measured in float64; E:
+    row scale (rows,)."""
     y, floor = s.bounds.admissible(y), rounding(u.dtype)
-    pair = lambda s, u, y, eps: Pair.of(u, y, stage_residuals(s, u, y), eps, floor)
-    return precisely(pair, s, u, y, eps)
+    pair = lambda s, E, u, y, eps: Pair.of(u, y, stage_residuals(s, E, u, y), eps, floor)
+    return precisely(pair, s, E, u, y, eps)
