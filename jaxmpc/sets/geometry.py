@@ -85,7 +85,8 @@ class Frame(NamedTuple):
         both = np.vstack([self.Z, -self.Z])
         r = maximise(-self.Z.sum(axis=0), both, np.repeat([0.0, 1.0], len(self.Z))).x
         assert r is not None  # 0 is feasible, and Z has rank n
-        off, size = self.Z @ r, np.abs(self.Z) @ np.abs(r)
+        # Of r, and of rows that were transformed, entries are rounding beside the largest.
+        off, size = self.Z @ r, np.abs(self.Z).max(axis=1) * np.abs(r).max()
         return not (np.any(off < -0.5) and np.all(off <= ROUNDING * size))
 
 

@@ -406,9 +406,13 @@ class Polytope(LinearSet):
         k, n = M.shape
         row, column = scaling(M, np.zeros(k))
         order = scipy.linalg.qr(row[:, None] * M * column, mode="r", pivoting=True)[1]
-        # z = (y, x[order[k:]]) = T x
-        T = np.vstack([M, np.eye(n)[order[k:]]])
-        lifted = self.preimage(np.linalg.inv(T))
+        # x of (y, x[rest]), with zeros that rounding leaves alone: it would bound sets where nothing
+        # does.
+        own, rest = order[:k], order[k:]
+        back, inverse = np.zeros((n, n)), np.linalg.inv(M[:, own])
+        back[own] = np.hstack([inverse, -inverse @ M[:, rest]])
+        back[rest, np.arange(k, n)] = 1.0
+        lifted = self.preimage(back)
         return lifted if k == n else lifted.project(range(k))
 
     def project(self, axes: Sequence[int]) -> "Polytope":

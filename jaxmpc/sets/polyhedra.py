@@ -204,7 +204,8 @@ def closest(G: np.ndarray, g: np.ndarray, x: np.ndarray) -> np.ndarray:
     on = z > 1e-10 * z.max(initial=0.0)
     exact = np.linalg.lstsq(G[on], -beyond[on], rcond=None)[0]
     room = ROUNDING * (np.abs(g) + np.abs(G) @ (np.abs(x) + np.abs(u)))
-    if np.all(G @ exact <= -beyond + room) and np.allclose(exact, u, rtol=1e-6, atol=1e-9 * unit):
+    push = np.linalg.lstsq(G[on].T, -exact, rcond=None)[0]
+    if np.all(G @ exact <= -beyond + room) and np.all(push >= -1e-9 * np.abs(push).max(initial=0)):
         u = exact
     return x + u
 

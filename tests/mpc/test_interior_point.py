@@ -1,4 +1,4 @@
-"""The interior point method stage by stage where its steps used to become short or to lead nowhere."""
+"""The interior point method stage by stage where steps became short or had no interior."""
 
 from dataclasses import replace
 

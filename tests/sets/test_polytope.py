@@ -330,6 +330,51 @@ def test_projection_supports_are_those_of_the_lifted_set(n, keep):
         assert Polytope(shadow.H[others], shadow.h[others]).support(shadow.H[i]) > shadow.h[i]
 
 
+def box_support(box, d):
+    """max d'x over a box with infinite sides, for each of the rows d."""
+    with np.errstate(invalid="ignore"):
+        ends = np.where(d > 0, d * box.upper, d * box.lower)
+    return np.where(d == 0, 0.0, ends).sum(axis=1)
+
+
+def test_images_and_sums_of_unbounded_sets_have_the_supports_of_their_parts():
+    """What rounding leaves in rows and rays must not bound a set that nothing else bounds."""
+    rng = np.random.default_rng(0)
+
+    def unbounded(n):
+        lower, upper = -rng.uniform(0.1, 2, n), rng.uniform(0.1, 2, n)
+        free = rng.uniform(size=(2, n))
+        return Box(np.where(free[0] < 0.5, -np.inf, lower), np.where(free[1] < 0.3, np.inf, upper))
+
+    for k in range(40):
+        box, M, d = unbounded(3), rng.normal(size=(2, 3)), rng.normal(size=(6, 2))
+        size = 10.0 ** rng.uniform(-2, 2, 3)
+        M[1] = M[0] if k % 2 else M[1]  # of half of them the image is flat
+        image = Box(box.lower * size, box.upper * size).image(M / size)
+        np.testing.assert_allclose(image.support(d), box_support(box, d @ M), rtol=1e-9, atol=1e-9)
+        R, box = rng.normal(size=(2, 2)), unbounded(2)
+        low, high = np.sort(rng.normal(size=(2, 2)), axis=0)
+        flat = Box(low, np.where([True, False], high, low))
+        total = box_support(box, d @ np.linalg.inv(R)) + box_support(flat, d)  # of {x : R x in box}
+        found = box.preimage(R).minkowski_sum(flat).support(d)
+        np.testing.assert_allclose(found, total, rtol=1e-9, atol=1e-9)
+
+
+def test_closest_points_in_units_that_differ():
+    """They keep all rows; no point of the set is nearer, by a linear program."""
+    rng = np.random.default_rng(391)
+    for _ in range(50):
+        size = 10.0 ** rng.uniform(-3, 3, 2)
+        G, inside, x = rng.normal(size=(6, 2)) / size, 10 * rng.normal(size=2) * size, 3 * size
+        g = G @ inside + rng.choice([0.0, 0.3, 1.0], 6)
+        y = Polytope(G, g).closest_point(x)
+        terms = np.abs(G) @ np.abs(y) + np.abs(g)
+        assert np.all(G @ y <= g + 1e-10 * terms)
+        away = (x - y) * size / np.abs((x - y) * size).max()
+        most = linprog(-away, G * size, g, bounds=[(None, None)] * 2)
+        assert -most.fun <= away @ (y / size) + 1e-7 * (1 + np.abs(y / size).max())
+
+
 def controllable_joints(joints, hide, coupled=False):
     """{(x, u) : x and x+ in the box, |u| <= 2} for joints with inertia 0.05, 0.1, ...
 

@@ -339,7 +339,7 @@ def conditions(s: Stages, u: Array, y: Array) -> Optimality:
 
 
 def stage_residuals(s: Stages, E: Array, u: Array, y: Array) -> Terms:
-    """As `qp.residuals.residual_terms`, for the condensed QP in the inputs; E: row scale (rows,)."""
+    """As `qp.residuals.residual_terms` for the condensed QP in the inputs; E (rows,): row scale."""
     return residuals_of(s, E, u, y, conditions(s, u, y))
 
 
