@@ -406,8 +406,7 @@ class Polytope(LinearSet):
         k, n = M.shape
         row, column = scaling(M, np.zeros(k))
         order = scipy.linalg.qr(row[:, None] * M * column, mode="r", pivoting=True)[1]
-        # x of (y, x[rest]), with zeros that rounding leaves alone: it would bound sets where nothing
-        # does.
+        # x of (y, x[rest]), its zeros exact: rounding would bound sets where nothing does.
         own, rest = order[:k], order[k:]
         back, inverse = np.zeros((n, n)), np.linalg.inv(M[:, own])
         back[own] = np.hstack([inverse, -inverse @ M[:, rest]])

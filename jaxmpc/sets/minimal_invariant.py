@@ -42,8 +42,8 @@ class MinimalInvariantSet(ConvexSet):
     closed (n, n): A + BK. E (n, p), disturbance: W. spread (n,): zero where E W has volume around
     the origin. alpha: with closed^steps (E W ⊕ …) ⊆ alpha (E W ⊕ …). normals (k, n): the directions
     in which that was compared, which show it. excess: along a coordinate, up or down, F reaches at
-    most 1 + excess times as far as the minimal set, where that reaches anywhere. exact_alpha: an upper bound of the least such
-    alpha in rational arithmetic, with W a Box; else None.
+    most 1 + excess times as far as the minimal set, where that reaches anywhere. exact_alpha: an
+    upper bound of the least such alpha in rational arithmetic, with W a Box; else None.
 
     All methods run in NumPy, not traceable.
     """
