@@ -183,7 +183,7 @@ def sum_of_disturbances(
     of a Box or Zonotope W. Raises ValueError for other sets."""
     W = Zonotope.from_box(W) if isinstance(W, Box) else W
     if not isinstance(W, Zonotope):
-        what = f"is a {type(W).__name__}, whose sum has no generators"
+        what = "is no Box or Zonotope, whose sums alone have generators"
         fail("disturbance", what, "Give a Box or a Zonotope, or use the supports of the sum")
     closed, E = np.asarray(closed, float), np.asarray(E, float)
     one = np.asarray(W.image(E).generators)

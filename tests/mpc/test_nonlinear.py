@@ -396,6 +396,22 @@ def two_joints(x, u):
     return jnp.concatenate([x[:2] + 0.05 * x[2:], x[2:] + 0.5 * u])
 
 
+def growing(x, u):
+    """Positive states that grow with every state and every dose, the more slowly the larger."""
+    return jnp.tanh(jnp.array([[0.6, 0.2], [0.1, 0.7]]) @ x + jnp.array([0.5, 1.0]) * u[0])
+
+
+def test_the_best_dose_may_be_none(x64):
+    """u ≥ 0 without another limit: all states, and all costs, are least for u = 0."""
+    system = jm.LinearSystem(np.eye(2), np.zeros((2, 1)))
+    mpc = jm.MPC(system, [1.0, 1.0], 0.1, 4, inputs=jm.Box(0.0, np.inf), terminal_cost=[1.0, 1.0])
+    x0s = np.random.default_rng(0).uniform(0.1, 2, (16, 2))
+    solve = lambda x: solve_nonlinear(NonlinearMPC(mpc, growing), x)
+    plan = jax.jit(jax.vmap(solve))(x0s)
+    assert (plan.status == SOLVED).all()
+    np.testing.assert_allclose(plan.inputs, 0.0, atol=1e-9)
+
+
 @pytest.mark.slow
 def test_one_qp_a_sample_comes_to_rest_at_a_target_out_of_reach(x64):
     """The arm ends stretched towards the target, 1.5 m away, where full Gauss-Newton steps
