@@ -19,7 +19,7 @@ from jaxmpc.mpc.condense import Inequalities, row_lengths
 from jaxmpc.pytrees import record
 from jaxmpc.sets.convex_sets import Polytope
 from jaxmpc.sets.geometry import affine_hull, framed
-from jaxmpc.sets.lp import Program, bound, cleaned, extent, maximise, power_of_two
+from jaxmpc.sets.lp import ROUNDING, Program, bound, extent, maximise, power_of_two
 
 # Bounds of linear programs are trusted to this, relative to the size of the set.
 TOLERANCE = 1e-9
@@ -252,8 +252,9 @@ def projected(plans: PlanPolytope, deadline: float = np.inf) -> CenteredPolytope
             normals, offsets = np.vstack([normals, normal]), np.append(offsets, offset)
         reached = np.vstack([reached, (center + directions)[~np.array(short)]])
         try:
-            # In these units bounds that are rounding are of a limit at zero.
-            outer = Polytope(normals, cleaned(offsets, 1.0)).require_body().reduce()
+            # In these units bounds that are rounding are of limits at zero.
+            offsets = np.where(np.abs(offsets) <= ROUNDING, 0.0, offsets)
+            outer = Polytope(normals, offsets).require_body().reduce()
             vertices = outer.vertices()
         except ValueError as error:
             return f"its facets are too ill-conditioned ({error})"

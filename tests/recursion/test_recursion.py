@@ -35,6 +35,31 @@ def settled(mpc):
     return settle_claims(mpc, FeasibilityProblem.of(mpc))
 
 
+@pytest.mark.parametrize("seed", range(8))
+def test_inputs_with_limits_through_zero_and_rates(seed):
+    """Supports of X_N along coordinates are often zero there, or what rounding leaves of that; they
+    are those of linear programs over (x, u_{-1}, u_0, u_1), and the weak claim is settled."""
+    rng = np.random.default_rng(seed)
+    A, one = rng.normal(size=(2, 2)), np.eye(2)
+    A, H = A / np.abs(np.linalg.eigvals(A)).max(), np.vstack([rng.normal(size=(2, 2)), one, -one])
+    B, h, rate = rng.normal(size=(2, 2)), np.array([0, 0, 1.5, 1.5, 1.2, 1.0]), [0.2, 1.4]
+    mpc = jm.MPC(
+        jm.LinearSystem(A, B, dt=1.0), one, one, 2, states=problems.symmetric(1.0, 1.0),
+        inputs=jm.Polytope(H, h), input_rate_limit=rate, constrained_stages=(0,),
+        terminal_set=problems.symmetric(1.0, 1.0),
+    )  # fmt: skip
+    claims, none = settled(mpc), 0 * one
+    moves = [[none, -one, one, none], [none, none, -one, one]]
+    rows = np.block([[one, none, none, none], *moves, [A @ A, none, A @ B, B]])
+    ends = np.concatenate([np.ones(2), rate, rate, np.ones(2)])
+    G = np.vstack([rows, -rows, np.hstack([np.zeros((18, 2)), np.kron(np.eye(3), H)])])
+    g = np.concatenate([ends, ends, h, h, h])
+    for d in [*np.eye(4), *-np.eye(4), *rng.normal(size=(4, 4))]:
+        top = linprog(-np.append(d, np.zeros(4)), G, g, bounds=[(None, None)] * 8)
+        assert claims.feasible_set.support(d)[0] == pytest.approx(-top.fun, rel=1e-7, abs=1e-7)
+    assert claims.weak.holds is not None, claims.weak.reason
+
+
 def has_plan(A, B, point, u_limit, rate) -> bool:
     """Whether (x, u_{-1}) has two inputs within limits and rates, |x_0|, |x_1| <= 1, by an LP."""
     (n, m), x = np.shape(B), point[: len(B)]
