@@ -196,11 +196,12 @@ class TestKnownAnswers:
 
     @pytest.mark.first(1)
     @pytest.mark.parametrize("iterations", [None, 0])
-    def test_zero_everything(self, iterations):
+    def test_zero_everything(self, x64, iterations):
+        n, m = 6, 15  # as in `solve_small`
         zeros, solver = np.zeros, jm.ADMM(iterations=iterations)
-        sol = jm.solve_qp(jm.QP(zeros((2, 2)), zeros(2), zeros((3, 2)), zeros(3), zeros(3)), solver)
+        sol = jm.solve_qp(jm.QP(zeros((n, n)), zeros(n), zeros((m, n)), zeros(m), zeros(m)), solver)
         assert sol.status == jm.Status.SOLVED
-        qp = jm.QP(np.eye(2), zeros(2), np.ones((3, 2)), zeros(3), zeros(3))
+        qp = jm.QP(np.eye(n), zeros(n), np.ones((m, n)), zeros(m), zeros(m))
         assert jm.solve_qp(qp, solver).status != jm.Status.PRIMAL_INFEASIBLE
 
     def test_duplicate_and_redundant_rows(self, x64):
@@ -658,7 +659,8 @@ class TestSettings:
 
     def test_warm_start_that_is_not_finite_counts_as_none(self, x64):
         qp, z, y = constructed(4, 0)
-        sol = jm.solve_qp(qp, FINE, warm_start=(np.full(4, np.nan), np.full(len(y), INF)))
+        solver = jm.ADMM(iterations=1000, newton_steps=0)
+        sol = jm.solve_qp(qp, solver, warm_start=(np.full(4, np.nan), np.full(len(y), INF)))
         np.testing.assert_allclose(sol.z, z, atol=1e-8)
 
     def test_warm_start_of_wrong_shape(self):
@@ -854,7 +856,8 @@ class TestOneRowDoesNotExcuseAnother:
         f32 = lambda v: np.asarray(v, np.float32)
         rows = f32([[1, 0], [1, 0], [0, 1e5]])
         qp = jm.QP(f32(np.eye(2)), f32([0, 0]), rows, f32([1, -np.inf, 1e5]), f32([np.inf, 0, 1e5]))
-        assert jm.solve_qp(qp).status == jm.Status.PRIMAL_INFEASIBLE
+        solver = jm.ADMM(iterations=100, newton_steps=0)
+        assert jm.solve_qp(qp, solver).status == jm.Status.PRIMAL_INFEASIBLE
 
     def test_small_remainder_of_a_large_multiplier_proves_nothing(self):
         """-10 ≤ z ≤ 10 and z ≤ -1 is feasible; absorbing 1e-5 in 1000 loses it to rounding."""

@@ -125,7 +125,7 @@ def proves_empty(qp, y):
 
 
 solve = jax.jit(jax.vmap(jm.solve_qp))
-BATCH = 132  # programs at a time, so that all tests share what is compiled
+BATCH = 44  # programs at a time, so that all tests share what is compiled
 
 
 def solutions(qps, dtype):
