@@ -31,6 +31,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from scipy.linalg import block_diag
 
 from jaxmpc.checks import fail, number
 from jaxmpc.pytrees import record
@@ -132,6 +133,12 @@ class Feet:
         for i, mu in enumerate(self.friction):
             faces[i, :, i] = [(-mu, *pair) for pair in signs]
         return faces.reshape(4 * len(self), 3 * len(self))
+
+    def edges(self) -> np.ndarray:
+        """Return the edges R (3k, 4k) of the friction cones, λ = R r with r ≥ 0: (1, ±μ, 0) and
+        (1, 0, ±μ)."""
+        edges = [[[1, 1, 1, 1], [mu, -mu, 0, 0], [0, 0, mu, -mu]] for mu in self.friction]
+        return block_diag(*edges)
 
 
 def _foot(model: "mujoco.MjModel", name: str) -> int:

@@ -6,14 +6,12 @@ contacts and dry friction do not help. What was found is tried on the file.
 
 import copy
 
-import jax
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.optimize import least_squares, lsq_linear
 
 from jaxmpc.checks import fail
 from jaxmpc.pytrees import record
-from jaxmpc.qp.problem import QP
-from jaxmpc.qp.solve import solve_qp
 from jaxmpc.robots.configurations import blocks
 from jaxmpc.robots.contacts import Feet
 from jaxmpc.robots.couplings import Couplings, equality_jacobian, projector
@@ -183,34 +181,35 @@ def rest_at(robot: RobotDescription, q: np.ndarray, *, within: bool = False) -> 
 
 
 # Weights of the inputs, of their half-widths, and of normal forces, beside that of tangential
-# forces, of the weight.
-_EFFORT, _NORMAL = 1e-2, 1e-4
+# forces, of the weight; and of the balance.
+_EFFORT, _NORMAL, _BALANCE = 1e-2, 1e-4, 1e6
 
 
 def _standing(forces: Forces, feet: Feet, q: np.ndarray) -> Rest:
     """Return the robot at rest on its feet in q (nq,): of the contact forces inside the friction
     cones and inputs within the limits that balance the weight, those of the least tangential
-    forces, and of these the least inputs. A quadratic program."""
+    forces, and of these the least inputs; where none do, those that leave the least.
+
+    Least squares with bounds: contact forces are combinations λ = R r, r ≥ 0, of the edges of the
+    cones, and the balance has a large weight (Lawson & Hanson, ch. 22)."""
     J, f = forces.affine(q)
-    G = feet.jacobian(forces.model, forces.data)
-    size, faces = 1 + float(np.abs(f).max()), feet.cones()
+    G, R = feet.jacobian(forces.model, forces.data), feet.edges()
+    size = 1 + float(np.abs(f).max())
     width = np.minimum((forces.upper - forces.lower) / 2, size)
-    on_feet = np.tile([_NORMAL, 1.0, 1.0], len(feet)) / (size / len(feet)) ** 2
-    balance = np.hstack([J, G.T])
-    inputs = np.eye(forces.m, forces.m + len(on_feet))
-    contacts = np.hstack([np.zeros((len(faces), forces.m)), faces])
-    below = np.full(len(faces), -np.inf)
-    with jax.enable_x64(True):
-        qp = QP(
-            P=np.diag(np.append(_EFFORT / width**2, on_feet)),
-            q=np.zeros(forces.m + len(on_feet)),
-            A=np.vstack([balance, inputs, contacts]),
-            l=np.concatenate([-f, forces.lower, below]),
-            u=np.concatenate([-f, forces.upper, np.zeros(len(faces))]),
-        )
-        drive, contact = np.split(np.asarray(solve_qp(qp).z), [forces.m])
-    drive = np.clip(drive, forces.lower, forces.upper)
-    missing = forces.at(q, drive) + G.T @ contact
+    on_feet = np.sqrt(np.tile([_NORMAL, 1.0, 1.0], len(feet))) * len(feet) / size
+    balance = _BALANCE / size
+    rows = np.vstack(
+        [
+            balance * np.hstack([J, G.T @ R]),
+            block_diag(np.diag(np.sqrt(_EFFORT) / width), on_feet[:, None] * R),
+        ]
+    )
+    aim = np.append(-balance * f, np.zeros(forces.m + len(on_feet)))
+    lower = np.append(forces.lower, np.zeros(R.shape[1]))
+    upper = np.append(forces.upper, np.full(R.shape[1], np.inf))
+    found = lsq_linear(rows, aim, (lower, upper), method="bvls", tol=1e-15)
+    drive, r = np.split(found.x, [forces.m])
+    missing = forces.at(q, drive) + G.T @ (R @ r)
     return Rest(q, *forces.parts(drive), drive, forces.lower, forces.upper, missing, size)
 
 

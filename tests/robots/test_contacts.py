@@ -145,7 +145,6 @@ def test_linear_model_against_the_c_engine(standing):
     np.testing.assert_allclose(slack, 0.5 * 9.81 * standing.mujoco.body_mass.sum(), rtol=1e-9)
 
 
-@pytest.mark.slow
 def test_statics_of_four_feet(quadruped):
     """Torques of rest need what a linear program finds: normal forces alone, of the weight."""
     robot = quadruped.standing(FEET)
@@ -168,7 +167,6 @@ def test_statics_of_four_feet(quadruped):
     np.testing.assert_allclose(found.x[:4].sum(), 9.81 * model.body_mass.sum(), rtol=1e-9)
 
 
-@pytest.mark.slow
 def test_weak_motors_hold_no_robot(quadruped):
     """With motors of 1 N m neither a linear program finds forces of rest, nor the library."""
     robot = quadruped.standing(FEET)
