@@ -18,7 +18,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -126,24 +126,29 @@ def gradient(function: Callable) -> Callable:
 
 
 def programs() -> dict[str, Callable[[int], Callable[[], Any]]]:
-    """What is run: from the batch to a call."""
-    shared = jm.Controller(joint(), SHORT)
-    plan = lambda x: shared.plan(x).inputs
+    """What is run: from the batch to a call. Nothing compiles before that."""
+    shared = cache(lambda: jm.Controller(joint(), SHORT))
+
+    def plan() -> Callable:
+        controller = shared()
+        return lambda x: controller.plan(x).inputs
+
     solve = lambda x, scale: jm.solve(
         replace(joint(), R=joint().R * scale), x, solver=SHORT
     ).inputs  # fmt: skip
     qp = lambda qp: jm.solve_qp(qp, SHORT).z
-    in_pairs = lambda x: jax.vmap(plan)(x)
-    scan = lambda x: jax.lax.scan(lambda x, _: (x + 0.01 * plan(x)[0], None), x, length=2)[0]
+    scan = lambda plan: (
+        lambda x: jax.lax.scan(lambda x, _: (x + 0.01 * plan(x)[0], None), x, length=2)[0]
+    )
     both = lambda scale, x: stagewise(x, scale)
     return {
         "plan, defaults": lambda b: compiled(
             lambda x: jm.Controller(joint()).plan(x).inputs, states(b)
         ),
-        "plan": lambda b: compiled(plan, states(b)),
-        "plan, nested vmap": lambda b: compiled(in_pairs, states(b).reshape(-1, 2, 2)),
-        "plan in a scan": lambda b: compiled(scan, states(b)),
-        "plan, gradient": lambda b: compiled(gradient(plan), states(b)),
+        "plan": lambda b: compiled(plan(), states(b)),
+        "plan, nested vmap": lambda b: compiled(jax.vmap(plan()), states(b).reshape(-1, 2, 2)),
+        "plan in a scan": lambda b: compiled(scan(plan()), states(b)),
+        "plan, gradient": lambda b: compiled(gradient(plan()), states(b)),
         "solve, own weights": lambda b: compiled(solve, states(b), scales(b)),
         "solve, own weights, gradient": lambda b: compiled(gradient(solve), states(b), scales(b)),
         "solve_qp, own matrices": lambda b: compiled(qp, random_qps(b)),
@@ -152,7 +157,7 @@ def programs() -> dict[str, Callable[[int], Callable[[], Any]]]:
         "simulate, gradient": lambda b: compiled(gradient(simulated), states(b), scales(b)),
         "solve_many": lambda b: lambda: jm.solve_many(joint(), np.asarray(states(b)), SHORT).inputs,
         "simulate_many": lambda b: (
-            lambda: jm.simulate_many(shared, joint().system, np.asarray(states(b)), 3).inputs
+            lambda: jm.simulate_many(shared(), joint().system, np.asarray(states(b)), 3).inputs
         ),  # fmt: skip
         "map_feasible_set": lambda b: (
             lambda: jm.map_feasible_set(joint(), np.asarray(states(b))).label
