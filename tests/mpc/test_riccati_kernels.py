@@ -63,10 +63,11 @@ def test_recurrences_in_pieces_are_the_scan(N, staged, adjoint):
         for shared in (False, True):
             given = (M[0], w, start) if shared else (M, w, start)
             axes = (None if shared else 0, 0, 0)
-            run = lambda f, axes=axes, given=given: jax.vmap(
-                functools.partial(f, adjoint=adjoint), axes
-            )(*map(jnp.asarray, given))
-            found, expected = run(kernels._recurrence_in_pieces), run(kernels._scan)
+            both = lambda *given: [
+                run(*given, adjoint=adjoint)
+                for run in (kernels._recurrence_in_pieces, kernels._scan)
+            ]
+            found, expected = jax.jit(jax.vmap(both, axes))(*given)
             np.testing.assert_allclose(found, expected, rtol=1e-13, atol=1e-13)
 
 
@@ -105,12 +106,11 @@ def test_riccati_recursions_in_pieces_are_the_scan(kind):
             A, B, Q = unit[:, None] * A / unit, unit[:, None] * B, Q / unit / unit[:, None]
         if kind == "staged":
             A, B = A + 0.1 * rng.normal(size=(N, n, n)), B + 0.1 * rng.normal(size=(N, n, m))
-        batch = [jnp.asarray(np.stack([v, 2 * v])) for v in (Q, R)]
-        axes = (0, 0, None, None)
-        found, expected = (
-            jax.vmap(run, axes)(*batch, jnp.asarray(A), jnp.asarray(B))
-            for run in (kernels._riccati_in_pieces, kernels._riccati_scan)
-        )
+        batch = [np.stack([v, 2 * v]) for v in (Q, R)]
+        both = lambda *given: [
+            run(*given) for run in (kernels._riccati_in_pieces, kernels._riccati_scan)
+        ]
+        found, expected = jax.jit(jax.vmap(both, (0, 0, None, None)))(*batch, A, B)
         for a, b in zip(found[:3], expected[:3], strict=True):
             size = jnp.max(jnp.abs(b), axis=2, keepdims=True)
             np.testing.assert_allclose(a / size, b / size, atol=1e-10)

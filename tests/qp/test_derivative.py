@@ -71,8 +71,9 @@ def evaluate(qps: list, ds: list, ct: tuple | None = None, smoothing=0.0, run=No
     cast = partial(jax.tree.map, lambda v: np.asarray(v, dtype))
     results = []
     for first in range(0, len(qps), BATCH):
-        fill = lambda trees: stack([trees[i % len(trees)] for i in range(first, first + BATCH)])
-        results.append((run or program())(*map(cast, (fill(qps), fill(ds), fill([ct]), smoothing))))
+        places = range(first, first + BATCH)
+        parts = [stack([trees[i % len(trees)] for i in places]) for trees in (qps, ds, [ct])]
+        results.append((run or program())(*map(cast, (*parts, smoothing))))
     return jax.tree.map(lambda *v: np.concatenate(v)[: len(qps)], *results)
 
 

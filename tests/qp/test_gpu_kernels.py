@@ -280,6 +280,16 @@ def call_recursions(dtype):
         jax.vmap(again, in_axes=(None, 0, 0))(A[0], gx[:, 1:], gx[:, 0])
 
 
+RECURSIONS = {
+    "riccati_stages",
+    "riccati_pieces",
+    "riccati_ends",
+    "tracking_stages",
+    "recurrence_stages",
+    "products_of_pieces",
+}
+
+
 @pytest.mark.parametrize(
     ("calls", "names"),
     [
@@ -294,17 +304,8 @@ def call_recursions(dtype):
         (call_in_registers, {"in_registers"}),
         (lambda: call_line_search(False), {"in_registers"}),
         (lambda: call_line_search(True), {"in_registers"}),
-        (
-            lambda: [call_recursions(dtype) for dtype in (jnp.float32, jnp.float64)],
-            {
-                "riccati_stages",
-                "riccati_pieces",
-                "riccati_ends",
-                "tracking_stages",
-                "recurrence_stages",
-                "products_of_pieces",
-            },
-        ),
+        (lambda: call_recursions(jnp.float64), RECURSIONS),
+        pytest.param(lambda: call_recursions(jnp.float32), RECURSIONS, marks=pytest.mark.slow),
     ],
     ids=[
         "rows",
@@ -317,6 +318,7 @@ def call_recursions(dtype):
         "line",
         "soft line",
         "recursions",
+        "recursions in float32",
     ],
 )
 def test_texts_of_kernels_compute_what_the_kernels_do(calls, names, texts, monkeypatch):
@@ -351,15 +353,15 @@ def test_kernels_traced_by_several_threads_are_those_of_one():
     """Each keeps its own stores while it is traced."""
 
     def counts(out):
-        for k in range(60):
+        for k in range(20):
             kernel.store(out.at[kernel.indices(16) + 16 * k], jnp.full(16, k + 1))
 
     def one(_):
-        return kernel.call(counts, jax.ShapeDtypeStruct((960,), jnp.int32))()
+        return kernel.call(counts, jax.ShapeDtypeStruct((320,), jnp.int32))()
 
     with ThreadPoolExecutor(4) as pool:
         for found in pool.map(one, range(8)):
-            np.testing.assert_array_equal(found, np.repeat(np.arange(60) + 1, 16))
+            np.testing.assert_array_equal(found, np.repeat(np.arange(20) + 1, 16))
 
 
 def lowered(function, states, monkeypatch, compiler=None):
