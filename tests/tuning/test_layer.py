@@ -32,7 +32,8 @@ def x64():
 
 @pytest.fixture(scope="module")
 def layer():
-    return jm.tuning.MPCLayer(MPC, NAMES)
+    # Without Newton steps a program compiles several times faster.
+    return jm.tuning.MPCLayer(MPC, NAMES, jm.ADMM(iterations=1000, newton_steps=0))
 
 
 @pytest.mark.slow
@@ -155,15 +156,21 @@ def test_the_terminal_weight_follows_what_is_learned(x64):
     """It is the P of `lqr` at every θ, beside differences; and P is a name of the terminal cost."""
     layer = jm.tuning.MPCLayer(MPC, ("Q", "R", "A"), terminal_weight="lqr")
     theta = {name: value + 0.1 for name, value in layer.init().items()}
-    made = layer.problem(theta)
+    made = jax.jit(layer.problem)(theta)
     P = jm.lqr(made.system, made.Q, made.R).P
     np.testing.assert_allclose(made.terminal_cost, P, rtol=1e-12)
-    corner = lambda r: layer.problem(theta | {"R": jnp.asarray(r)}).terminal_cost[0, 0]
-    slope = jax.grad(corner)(theta["R"])
-    np.testing.assert_allclose(slope, approx_fprime(theta["R"], corner, 1e-6), rtol=1e-4)
+
+    @jax.jit
+    @jax.value_and_grad
+    def corner(r):
+        return layer.problem(theta | {"R": r}).terminal_cost[0, 0]
+
+    expected = approx_fprime(theta["R"], lambda r: corner(r)[0], 1e-6)
+    np.testing.assert_allclose(corner(theta["R"])[1], expected, rtol=1e-4)
     for learn, message in (("P", "P is learned itself"), ("terminal_cost", "terminal_cost is")):
         mpc = replace(MPC, terminal_cost=np.eye(2))
-        assert jm.tuning.MPCLayer(mpc, learn).problem({learn: np.ones(2)}).terminal_cost[0, 1] == 0
+        problem = jax.jit(jm.tuning.MPCLayer(mpc, learn).problem)
+        assert problem({learn: np.ones(2)}).terminal_cost[0, 1] == 0
         with pytest.raises(ValueError, match=f"terminal_weight: 'lqr', and {message}"):
             jm.tuning.MPCLayer(mpc, learn, terminal_weight="lqr")
     with pytest.raises(ValueError, match='terminal_weight: .Q.. Give "given"'):
