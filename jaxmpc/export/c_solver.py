@@ -116,6 +116,23 @@ def _sizes(controller: Controller) -> dict[str, Any]:
 
 def _tables(controller: Controller) -> dict[str, Any]:
     """Every table of `mpc.c` by its name, in float64 and int."""
+    mpc, c = controller.mpc, controller.condensed
+    assert c is not None
+    tables = jax.tree.map(np.asarray, _computed(controller)) | input_limits(mpc)
+    if c.balls:
+        tables["ball_rows"] = np.array(c.balls)
+    if not isinstance(c, PolicyCondensed):
+        N = mpc.horizon
+        later = [mpc.moves[b + 1] if b + 1 < N else -1 for b in c.begins]
+        tables |= jax.tree.map(np.asarray, _of_warm_starts(controller))
+        tables["later_move"] = np.array(later, int)
+        tables["later_row"] = tables["later_row"].astype(int) - 1
+    return {key: np.asarray(value) for key, value in tables.items()}
+
+
+@jax.jit  # in one program, not in a hundred small ones
+def _computed(controller: Controller) -> dict[str, Any]:
+    """The tables of the program and its factorization."""
     mpc, c, factor = controller.mpc, controller.condensed, controller.factor
     assert c is not None and factor is not None
     N, n, m = mpc.horizon, mpc.system.n, mpc.system.m
@@ -153,40 +170,32 @@ def _tables(controller: Controller) -> dict[str, Any]:
     if bounds.linear is not None:
         tables |= {"soft_linear": bounds.linear, "soft_quadratic": bounds.quadratic}
     if c.balls:
-        tables |= {"radius": bounds.radius, "ball_rows": np.array(c.balls)}
-    tables |= input_limits(mpc)
-    if not isinstance(c, PolicyCondensed):
-        tables |= _of_warm_starts(controller)
-    return {key: np.asarray(value) for key, value in tables.items()}
+        tables["radius"] = bounds.radius
+    return tables
 
 
+@jax.jit
 def _of_warm_starts(controller: Controller) -> dict[str, Any]:
-    """The tables by which a plan begins with the one before."""
+    """The tables by which a plan begins with the one before.
+
+    later_row: number of the row of the last plan, from 1, whose multiplier each row begins with, 0
+    for none: what `Controller.shifted` does to multipliers that are the numbers of their rows."""
     mpc, c = controller.mpc, controller.condensed
-    N = mpc.horizon
+    assert c is not None
+    N, n, m = mpc.horizon, mpc.system.n, mpc.system.m
+    numbers = jnp.arange(1.0, c.C.shape[0] + 1)
+    start = WarmStart(jnp.zeros((N + 1, n)), jnp.zeros((N, m)), numbers)
     tables = {
         "end_theta": c.Phi[N],
         "end_z": c.Gamma[N],
         "end_constant": c.phi[N],
         "tail_gain": c.K_N,
         "prestabilising_gain": c.K,
+        "later_row": start.shifted(c.layout, jnp.zeros(m), bool(c.balls)).multipliers,
     }
     if mpc.rate_limited:
         tables |= {"last_theta": c.Psi[-1], "last_z": c.Omega[-1], "last_constant": c.psi[-1]}
-    later = [mpc.moves[b + 1] if b + 1 < N else -1 for b in c.begins]
-    return {**tables, "later_move": np.array(later, int), "later_row": _later_rows(controller)}
-
-
-def _later_rows(controller: Controller) -> np.ndarray:
-    """Row of the last plan whose multiplier each row begins with, -1 for none: what
-    `Controller.shifted` does to multipliers that are the numbers of their rows."""
-    c, mpc = controller.condensed, controller.mpc
-    assert c is not None
-    N, n, m = mpc.horizon, mpc.system.n, mpc.system.m
-    numbers = jnp.arange(1.0, c.C.shape[0] + 1)
-    start = WarmStart(jnp.zeros((N + 1, n)), jnp.zeros((N, m)), numbers)
-    shifted = start.shifted(c.layout, jnp.zeros(m), bool(c.balls))
-    return np.asarray(shifted.multipliers).astype(int) - 1
+    return tables
 
 
 # --- Closed loops under the law of the code, beside plans that are solved to the end ----

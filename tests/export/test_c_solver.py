@@ -113,6 +113,14 @@ class Compiled:
         return u, status
 
 
+def test_few_programs_are_compiled(tmp_path, request):
+    """A factorization and two of tables; they were a hundred small ones."""
+    programs = request.getfixturevalue("compiled")
+    programs.clear()
+    export_c(problems.joint_o_inf(6), tmp_path, STEPS)
+    assert 0 < len(programs) <= 6
+
+
 @compiled
 @pytest.mark.parametrize(
     "case",
