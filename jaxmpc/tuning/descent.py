@@ -201,6 +201,8 @@ def descend(
     state = State(theta, None, thetas=[theta])
     mark = fingerprint(decides, theta)
     _require_first_order(optimizer, theta)
+    # In one program each, not in many small ones.
+    optimizer = optax.GradientTransformation(jax.jit(optimizer.init), jax.jit(optimizer.update))
     if path is not None:
         remove_partial(path)
     if path is not None and path.exists():

@@ -176,12 +176,13 @@ def values(parameters: Parameters, theta: Mapping[str, Any]) -> dict[str, Array]
 
 def exact_values(parameters: Parameters, theta: Any) -> dict[str, np.ndarray]:
     """Return the values at θ as float64 NumPy arrays."""
-    with jax.enable_x64(True):
-        return jax.tree.map(np.asarray, values(parameters, theta))
+    return jax.tree.map(
+        lambda v: v[0], trajectory(parameters, jax.tree.map(lambda v: np.asarray(v)[None], theta))
+    )
 
 
 def trajectory(parameters: Parameters, thetas: Any) -> dict[str, np.ndarray]:
     """Return the values at each of T points θ, leaves (T, …), as float64 NumPy arrays."""
     with jax.enable_x64(True):
-        found = jax.vmap(partial(values, parameters))(jax.tree.map(jnp.asarray, thetas))
+        found = jax.jit(jax.vmap(partial(values, parameters)))(thetas)
         return jax.tree.map(np.asarray, found)

@@ -24,7 +24,7 @@ from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import record
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.tuning.descent import Descent, Settings
-from jaxmpc.tuning.parameters import Parameters, exact_values, is_diagonal, trajectory
+from jaxmpc.tuning.parameters import Parameters, is_diagonal, trajectory
 
 CHECKPOINT = "checkpoint.npz"
 # Where the files of a run that is overwritten wait.
@@ -69,9 +69,9 @@ class TuningRun:
     ) -> "TuningRun":
         """Return the run of a descent of `parameters`, whose start is what was given."""
         initial = {name: np.asarray(p.value) for name, p in parameters.items()}
-        improved = history.best > 0
+        improved, trace = history.best > 0, trajectory(parameters, history.thetas)
         return cls(
-            exact_values(parameters, history.theta) if improved else initial,
+            {name: v[history.best] for name, v in trace.items()} if improved else initial,
             initial,
             history.measured(0),
             history.measured(history.best),
@@ -79,7 +79,7 @@ class TuningRun:
             settings,
             build,
             history,
-            trajectory(parameters, history.thetas),
+            trace,
         )
 
     @property

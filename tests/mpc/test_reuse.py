@@ -188,7 +188,7 @@ def test_cells():
     x = np.random.default_rng(2).normal(size=(5000, 2))
     with jax.enable_x64(True):
         index, cells = many.choose(x)
-        near = np.asarray(jax.vmap(cells.nearest)(x))
+        near = np.asarray(jax.jit(jax.vmap(cells.nearest))(x))
     assert len(np.unique(index)) == len(index)
     np.testing.assert_array_equal(np.asarray(cells.states)[: len(index)], x[index])
     distance = np.linalg.norm(x - x[index][near], axis=1)
