@@ -110,7 +110,8 @@ def tune_solver(
     given, c = replace(solver, iterations=iterations), objective.condensed
     if solver.rho is None:
         with jax.enable_x64(True):
-            given = replace(given, rho=float(c.factor(solver).rho[0, 0]))
+            first = jax.jit(lambda c, solver: c.factor(solver).rho[0, 0])
+            given = replace(given, rho=float(first(c, solver)))
     decides: dict[str, Any] = {
         "version": VERSION,
         "iterations": int(iterations),
