@@ -103,10 +103,10 @@ class TestChunks:
 
     def test_times(self):
         """Compiling and running apart; what the caller does between two chunks is neither."""
-        pause = 0.05
+        pause, problem = 0.05, FeasibilityProblem.of(problems.scalar(horizon=3))
         for again in (False, True):
             begun, spent, compiled = time.perf_counter(), 0.0, 0.0
-            for part in (p.result for p in label_chunks(scalar(), self.POINTS[:, None], chunk=77)):
+            for part in (p.result for p in label_chunks(problem, self.POINTS[:, None], chunk=77)):
                 assert part.run_seconds > 0 and part.compile_seconds >= 0
                 spent += part.run_seconds + part.compile_seconds
                 compiled += part.compile_seconds
