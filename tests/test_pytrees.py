@@ -95,10 +95,10 @@ def test_controller_is_rebuilt_where_it_is_replaced():
 def test_donated_controller():
     """No array of it is another's, nor the user's."""
     Q = jnp.array([1.0, 0.5])
-    mpc = problem(Q=Q)
+    mpc, solver = problem(Q=Q), jm.ADMM(newton_steps=0)  # compiles fastest
     step = jax.jit(lambda c, x: (c, c.plan(x).inputs), donate_argnums=0)
-    want = step(jm.Controller(problem()), X0)[1]
-    controller = jm.Controller(mpc)
+    want = step(jm.Controller(problem(), solver), X0)[1]
+    controller = jm.Controller(mpc, solver)
     leaves = [v for v in jax.tree.leaves(controller) if v.size]
     assert len({v.unsafe_buffer_pointer() for v in leaves}) == len(leaves)
     again, inputs = step(controller, X0)

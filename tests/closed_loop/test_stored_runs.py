@@ -61,7 +61,7 @@ def test_runs_are_stored_resumed_and_those_of_simulate_many(tmp_path, monkeypatc
     )
     assert found.timing.count == 3 and begun == [1] and "StoredRuns(" in repr(found)
     numbers = plant_numbers(joint, factors)
-    run = simulate_many(feedback, joint, x0s, STEPS, variations=numbers, chunk=4)
+    run = simulate_many(feedback, joint, x0s, STEPS, variations=numbers, chunk=3)
     np.testing.assert_array_equal(found.run.states, run.states)
     data = xr.open_zarr(path).load()
     np.testing.assert_array_equal(data["states"], run.states)

@@ -68,6 +68,7 @@ def room(mpc, x0):
     return -found.fun
 
 
+@pytest.mark.first(20)
 @pytest.mark.parametrize("seed", range(40))
 def test_each_plan_is_solved_or_proved_infeasible(seed):
     mpc, x0s = draw(np.random.default_rng(seed))

@@ -105,16 +105,21 @@ def test_no_false_status_in_any_units(make, decades, x64):
         assert np.mean(np.isin(status, allowed)) >= 0.95
 
 
-@pytest.mark.parametrize(("x64", "least"), [(False, (1e-5, 1e-6, 1e-9)), (True, (1e-10, 1e-13))])
+@pytest.mark.parametrize(("x64", "least"), [(True, (1e-10, 1e-13)), (False, (1e-5, 1e-6, 1e-9))])
 @pytest.mark.first(1)
 def test_a_small_coefficient_still_bounds(x64, least):
-    """min ½ z₂² − z₁ with least·z₁ ≤ 1: the optimum lies at 1/least, it is not at infinity."""
-    programs = [
-        (np.diag([0.0, 1.0]), [-1.0, 0.0], [[small, 0], [1, 1]], [-INF, -1], [1, INF])
-        for small in least
-    ]
+    """min ½ z₂² − z₁ with least·z₁ ≤ 1: the optimum lies at 1/least, it is not at infinity.
+
+    Beside two variables of their own, in programs of as many rows as those of `test_statuses.py`,
+    so that one is compiled."""
+    A, free = np.zeros((6, 4)), np.full(4, INF)
+    programs = []
+    for small in least:
+        A[:2, :2] = [[small, 0], [1, 1]]
+        l, u = np.append([-INF, -1], -free), np.append([1, INF], free)
+        programs.append((np.diag([0.0, 1, 1, 1]), [-1.0, 0, 0, 0], A.copy(), l, u))
     with jax.enable_x64(x64):
-        some = [programs[i % len(programs)] for i in range(50)]  # and the program of the last test
+        some = [programs[i % len(programs)] for i in range(48)]
         status = solve(batch(some, float if x64 else np.float32)).status
     undecided = jm.Status.ITERATION_LIMIT, jm.Status.INACCURATE
     assert np.isin(status, [jm.Status.SOLVED, *undecided]).all()
@@ -242,13 +247,14 @@ def test_steps_of_admm_that_move_nothing_are_inaccurate():
 
 
 def test_solutions_say_what_their_status_means():
-    q = np.ones((50, 2))
+    q = np.ones((48, 4))
     q[7] = np.nan
-    qp = batch([(np.eye(2), v, np.eye(2), -np.ones(2), np.ones(2)) for v in q], np.float32)
-    many = solve(qp)
-    np.testing.assert_array_equal(many.solved, np.arange(50) != 7)
-    assert "status=49 SOLVED + 1 NON_FINITE" in repr(many) and len(repr(many)) < 500
-    with pytest.raises(ValueError, match="sentence: of 49 SOLVED"):
+    with jax.enable_x64(True):  # the program of `test_a_small_coefficient_still_bounds`
+        qp = batch([(np.eye(4), v, np.eye(6, 4), -np.ones(6), np.ones(6)) for v in q], float)
+        many = solve(qp)
+    np.testing.assert_array_equal(many.solved, np.arange(48) != 7)
+    assert "status=47 SOLVED + 1 NON_FINITE" in repr(many) and len(repr(many)) < 500
+    with pytest.raises(ValueError, match="sentence: of 47 SOLVED"):
         _ = many.sentence
     assert jax.tree.map(lambda v: v[7], many).sentence == jm.Status.NON_FINITE.sentence
     one = jax.tree.map(lambda v: v[0], many)

@@ -54,17 +54,16 @@ def by_clarabel(P, q, A, l, u):
     return str(found.status), found.obj_val
 
 
-@jax.jit
-@jax.vmap
-def solve(P, q, A, l, u):
-    return jm.solve_qp(jm.QP(P, q, A, l, u))
+solve = jax.jit(jax.vmap(jm.solve_qp))
 
 
 def solved(programs):
     """Return the solutions of programs of like shapes, in NumPy; 48 at a time."""
     parts = [np.stack(part) for part in zip(*programs, strict=True)]
     with jax.enable_x64(True):
-        some = [solve(*(v[i : i + 48] for v in parts)) for i in range(0, len(programs), 48)]
+        some = [
+            solve(jm.QP(*(v[i : i + 48] for v in parts))) for i in range(0, len(programs), 48)
+        ]
     return jax.tree.map(lambda *v: np.concatenate(v), *some)
 
 

@@ -105,12 +105,13 @@ def test_a_plant_outside_jax_that_rounds_inputs_and_sticks():
     found = tuned(draw(0), mode="sampling")
     assert found.settings["mode"] == "sampling" and found.history.accepted.all()
 
+    control = jax.jit(jax.vmap(lambda values, x: found.build(values)(x).u, (None, 0)))
+
     def mean_loss(values):
         """The loops again, without `simulate`."""
-        control, x = jax.jit(jax.vmap(lambda x: found.build(values)(x).u)), draw(1)
-        losses = []
+        x, losses = draw(1), []
         for _ in range(25):
-            u = np.asarray(control(x))
+            u = np.asarray(control(values, x))
             losses.append(x**2 @ [1.0, 0.1] + 0.01 * u[:, 0] ** 2)
             x = valve(x, u)
         return np.mean(losses)
