@@ -116,6 +116,7 @@ def test_time_varying_filter_is_the_textbook_recursion():
     observer = KalmanFilter(PLANT, W, V, initial=np.sqrt(np.diag(P)), start=[0.1, 0.0])
     feedback = LinearFeedback(MPC, K, PLANT)
     run = jm.simulate(feedback, PLANT, np.array([0.5, 0.0]), 30, noise=NOISE, observer=observer)
+    run = jax.tree.map(np.asarray, run)
     xi, C, y = np.array([0.1, 0.0]), np.array([[1.0, 0.0]]), None
     v = np.asarray(NOISE.prepared(2, 1).draw(30, 2, 1, jnp.float64)[1])
     for t in range(30):

@@ -72,7 +72,7 @@ def planar(request):
     middle = corners.mean(axis=0)
     near = [middle + (corners - middle) * (1 + s) for s in (1e-3, -1e-3, 1e-6, -1e-6, 0.0)]
     points = np.concatenate([points, *near])
-    return mpc, polygon, jm.map_feasible_set(mpc, points, chunk=1024).refine(1e-7)
+    return mpc, polygon, jm.map_feasible_set(mpc, points, chunk=64).refine(1e-7)
 
 
 def test_published_areas():

@@ -65,7 +65,7 @@ def readings(good):
 
 @pytest.mark.first(1)
 @pytest.mark.parametrize(
-    "steps", [{}, {"newton_steps": 0, "iterations": 200}], ids=["exact", "ADMM"]
+    "steps", [{"newton_steps": 0, "iterations": 1000}, {}], ids=["ADMM", "exact"]
 )
 @pytest.mark.parametrize("kind", KINDS)
 def test_controller(kind, steps):
@@ -80,7 +80,7 @@ def test_controller(kind, steps):
     after = np.s_[:, AT + 1 :]
     solved = status[after] == jm.Status.SOLVED
     assert solved[cold_status[after] == jm.Status.SOLVED].all()
-    assert steps or solved.all()
+    assert solved.all()
     np.testing.assert_allclose(planned[after][solved], cold[after][solved], atol=1e-4)
 
 

@@ -32,10 +32,10 @@ def robust(policy: str, **fields) -> jm.MPC:
     return jm.MPC(SYSTEM, np.eye(2), 0.1, states=X, inputs=U, policy=policy, **{**given, **fields})
 
 
-def plans(mpc: jm.MPC, states: np.ndarray, solver: jm.ADMM = jm.ADMM()) -> jm.mpc.Plan:
+def plans(mpc: jm.MPC, states: np.ndarray, **solver) -> jm.mpc.Plan:
     """One after the other: half of what a batch has to compile."""
     with enable_x64():
-        controller = jm.Controller(mpc, solver)
+        controller = jm.Controller(mpc, jm.ADMM(**solver))
         each = [controller.plan(x0) for x0 in states]
         return jax.tree.map(lambda *v: np.stack(v), *each)
 
@@ -198,8 +198,8 @@ def least_first_inputs(mpc: jm.MPC, states: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("policy", ["tube", pytest.param("affine", marks=pytest.mark.slow)])
 def test_without_limits_the_nominal_inputs_are_those_of_the_lqr(policy):
     mpc = robust(policy, terminal_set=None)
-    solver = jm.ADMM(differentiate="unrolled")  # compiles fastest
-    found = plans(replace(mpc, states=None, inputs=None), STATES[:2], solver)
+    free, fastest = replace(mpc, states=None, inputs=None), {"differentiate": "unrolled"}
+    found = plans(free, STATES[:2], **fastest)  # to compile
     assert (found.status == jm.Status.SOLVED).all()
     np.testing.assert_allclose(found.inputs[:, 0], STATES[:2] @ LAW.K.T, atol=1e-7)
 
