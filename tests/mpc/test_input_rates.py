@@ -101,9 +101,7 @@ def test_a_shifted_plan_ends_within_its_rate_limits():
     inputs, states = np.tile([0.9, -0.5], (N, 1)), np.full((N + 1, n), 4.0)
     rows = np.zeros(len(jm.mpc.row_table(mpc)))
     shifted = jax.jit(jm.Controller(mpc).shifted)
-    tails = [
-        shifted(jm.mpc.WarmStart(sign * states, inputs, rows)).inputs[-1] for sign in (1, -1)
-    ]
+    tails = [shifted(jm.mpc.WarmStart(sign * states, inputs, rows)).inputs[-1] for sign in (1, -1)]
     ends = np.array([[0.6, 1.0], [-0.7, -0.15]])  # -0.3, +0.25 but 1 at most; -0.2, +0.35
     np.testing.assert_allclose(np.sort(tails, axis=0).T, ends)
 

@@ -61,9 +61,7 @@ def solved(programs):
     """Return the solutions of programs of like shapes, in NumPy; 48 at a time."""
     parts = [np.stack(part) for part in zip(*programs, strict=True)]
     with jax.enable_x64(True):
-        some = [
-            solve(jm.QP(*(v[i : i + 48] for v in parts))) for i in range(0, len(programs), 48)
-        ]
+        some = [solve(jm.QP(*(v[i : i + 48] for v in parts))) for i in range(0, len(programs), 48)]
     return jax.tree.map(lambda *v: np.concatenate(v), *some)
 
 
