@@ -136,11 +136,7 @@ def test_closed_loop_is_the_controllers(case, tmp_path):
         A, B = (np.asarray(v)[0] if v.ndim == 3 else np.asarray(v) for v in (system.A, system.B))
         for start, reference, effort in ((0.5, None, None), (1.2, 0.3, 0.1)):
             x = np.full(system.n, start)
-            # Cold, as the code after a reset: not from a plan of zeros, but from one so far off
-            # that it counts as none; so one program serves all steps.
-            control = law.start(x)
-            far = jax.tree.map(lambda v: np.full(v.shape, 1e6), control.memory)
-            control = control._replace(memory=far)
+            control = None  # cold, as the code after a reset: not from a plan of zeros
             code.memory[:] = 0
             target = None if reference is None else np.full(system.n, reference)
             input_target = None if effort is None else np.full(system.m, effort)
