@@ -358,8 +358,8 @@ class Pipeline:
         self.margins = problem.row_margins(exact, scope.typical)
         programs = min(MOST_PROGRAMS, MOST_ENTRIES // max(problem.rows.U.size, 1))
         self.share = -(-programs // max(scope.parts, 1))
-        # A power of two where it is small, so that maps of a few points more have compiled programs;
-        # and as the devices share it.
+        # A power of two where it is small, so that maps of a few points more compile nothing; and
+        # as the devices share it.
         few = max(FEWEST, 1 << (chunk - 1).bit_length())
         self.whole = divisible(few if chunk < SMALL else chunk, self.devices)
         each = gather_size(self.whole // count(self.devices))
