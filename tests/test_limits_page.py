@@ -59,9 +59,16 @@ REFUSED = {
         lambda: theorems(problem(control_horizon=2)),
         lambda: theorems(problem(outputs=jm.Outputs([[1.0, 0.0]], upper=4.0))),
     ],
-    "Explicit laws, `solve_stagewise` and `OffsetFreeController` are those of `policy=": [
+    "Explicit laws and `OffsetFreeController` are those of `policy=": [
         lambda: jm.explicit.critical_regions(problem(disturbance=W, policy="affine")),
         lambda: jm.explicit.critical_regions(problem(disturbance=W, policy="tube")),
+    ],
+    "`solve_stagewise` takes no tubes, and of affine policies Boxes and Zonotopes": [
+        lambda: jm.mpc.solve_stagewise(problem(disturbance=W, policy="tube"), [0, 0]),
+        lambda: jm.mpc.solve_stagewise(
+            problem(disturbance=jm.sets.Zonotope([0, 0], [[1, 0, 1], [0, 1, 1]]), policy="affine"),
+            [0, 0],
+        ),
     ],
     "Tubes take no control horizon": [
         lambda: jm.solve(problem(disturbance=W, policy="tube", control_horizon=2), [0, 0]),
@@ -84,13 +91,6 @@ def test_what_is_not_taken_is_refused(sentence):
     for call in REFUSED[sentence]:
         with pytest.raises(ValueError, match=r"^[\w.]+: "):
             call()
-
-
-def test_stagewise_takes_no_disturbance():
-    says("Nonlinear problems, `solve_stagewise`")
-    robust = problem(disturbance=jm.Box([-0.1, -0.1], [0.1, 0.1]))
-    with pytest.raises(ValueError, match="disturbance"):
-        jm.mpc.solve_stagewise(robust, [0.0, 0.0])
 
 
 def test_an_invariant_set_has_no_derivative():

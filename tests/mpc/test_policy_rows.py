@@ -1,5 +1,6 @@
-"""Plans under affine policies and tubes: against a program with a row for each sequence of
-disturbances (DAQP), all sequences in open and in closed loop, and the labels of maps."""
+"""Plans under affine policies and tubes, of condensed QPs and stage by stage: against a program
+with a row for each sequence of disturbances (DAQP), all sequences in open and in closed loop, and
+the labels of maps."""
 
 import itertools
 from dataclasses import replace
@@ -96,6 +97,15 @@ def worst_rows(mpc: jm.MPC, x: np.ndarray, u: np.ndarray) -> float:
     return max(*beyond, float(np.max(np.abs(u))) - 1)
 
 
+def rolled_out(system, plan: jm.mpc.Plan, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return states (K, N+1, n) and inputs (K, N, m) of an affine policy under w (K, N, n)."""
+    u = plan.inputs + np.einsum("kmjp,sjp->skm", plan.feedback, w)
+    x = [np.tile(plan.states[0], (len(w), 1))]
+    for k in range(w.shape[1]):
+        x.append(x[-1] @ np.asarray(system.A).T + u[:, k] @ np.asarray(system.B).T + w[:, k])
+    return np.stack(x, 1), u
+
+
 def labelled(mpc: jm.MPC) -> tuple[np.ndarray, np.ndarray]:
     hull = policy_hull(problem_of(mpc))
     ends, center = hull.bounds.points[:8], hull.rays.center
@@ -170,13 +180,9 @@ def test_affine_plans_are_the_best_of_all():
         assert status == (jm.Status.SOLVED if best < np.inf else jm.Status.PRIMAL_INFEASIBLE)
         if best < np.inf:
             np.testing.assert_allclose(cost, best, rtol=1e-6, atol=1e-7)
-    w = sequences(mpc)
     for i in np.flatnonzero(labels == 1):
-        u = plan.inputs[i] + np.einsum("kmjp,sjp->skm", plan.feedback[i], w)
-        x = [np.tile(states[i], (len(w), 1))]
-        for k in range(3):
-            x.append(x[-1] @ A.T + u[:, k] @ B.T + w[:, k])
-        assert worst_rows(mpc, np.stack(x, 1), u) < 2e-6
+        one = jax.tree.map(lambda v, i=i: v[i], plan)
+        assert worst_rows(mpc, *rolled_out(mpc.system, one, sequences(mpc))) < 2e-6
 
 
 def least_first_inputs(mpc: jm.MPC, states: np.ndarray) -> np.ndarray:
@@ -480,3 +486,104 @@ def test_soft_rows_rates_and_blocks(policy, fields):
 def test_errors(fields, message):
     with pytest.raises(ValueError, match=message):
         jm.solve(robust(**{"policy": "affine", **fields}), [0.0, 0.0])
+
+
+def test_policies_stage_by_stage_are_the_best_of_all():
+    """Costs are those of the program with all sequences, and the policy keeps all limits under
+    them; where that has no policy, none is claimed."""
+    mpc, costs = robust("affine"), []
+    with enable_x64():
+        for x0 in STATES:
+            plan, best = jm.mpc.solve_stagewise(mpc, x0), least_cost(mpc, x0)
+            costs.append(best)
+            if best == np.inf:
+                assert plan.status == jm.Status.ITERATION_LIMIT
+                continue
+            assert plan.solved
+            np.testing.assert_allclose(plan.cost, best, rtol=1e-7, atol=1e-8)
+            assert worst_rows(mpc, *rolled_out(SYSTEM, plan, sequences(mpc))) < 1e-9
+    assert 0 < np.isfinite(costs).sum() < len(costs)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"soft": SOFT},
+        RATES,
+        {"soft": SOFT, "disturbance": jm.Box([-0.1, -0.1], [0.1, 0.1]), **RATES},
+        {"disturbance": jm.sets.Zonotope([0.02, -0.01], [[0.06, 0.02], [-0.03, 0.05]])},
+    ],
+)
+def test_soft_rows_and_rates_stage_by_stage(fields):
+    """The least cost is that of DAQP with all vertices."""
+    mpc = robust("affine", **{"disturbance": jm.Box([-0.1, -0.05], [0.05, 0.1]), **fields})
+    before, costs = np.array([-0.2]), []
+    with enable_x64():
+        for x0 in np.vstack([STATES[:4] + [0.1, 0.0], [4.5, 1.8]]):
+            plan = jm.mpc.solve_stagewise(mpc, x0, previous_input=before)
+            costs.append(least_cost_of_affine(mpc, x0, before))
+            assert plan.solved == np.isfinite(costs[-1])
+            if plan.solved:
+                np.testing.assert_allclose(plan.cost, costs[-1], rtol=1e-7)
+    assert 3 <= np.isfinite(costs).sum() < len(costs)
+
+
+@pytest.mark.slow
+def test_a_policy_that_is_not_proved_best_keeps_all_limits():
+    """After few steps it costs more, and its status tells it from the best one and from none."""
+    mpc, x0 = robust("affine"), STATES[1]
+    with enable_x64():
+        best = least_cost(mpc, x0)
+        plan = jm.mpc.solve_stagewise(mpc, x0, solver=jm.ADMM(newton_steps=4))
+        none = jm.mpc.solve_stagewise(mpc, [-5.5, 0.0], solver=jm.ADMM(newton_steps=4))
+    assert plan.status == jm.Status.INACCURATE
+    assert none.status == jm.Status.ITERATION_LIMIT
+    assert best + 1e-3 < float(plan.cost) < 2 * best
+    assert worst_rows(mpc, *rolled_out(SYSTEM, plan, sequences(mpc))) <= 0
+    assert worst_rows(mpc, *rolled_out(SYSTEM, none, sequences(mpc))) > 1e-3
+
+
+@pytest.mark.slow
+def test_long_horizons_stage_by_stage():
+    """Two masses and springs over 20 steps, a batch of states and of sizes of W: 1,000 random
+    sequences and 1,000 of vertices break no limit; without W the plan is the undisturbed one, and
+    no set in another has the lower cost."""
+    n, N = 4, 20
+    K = 2 * np.eye(2) - np.eye(2, k=1) - np.eye(2, k=-1)
+    field = 0.15 * np.block([[np.zeros((2, 2)), np.eye(2)], [-K, -0.1 * np.eye(2)]])
+    A = np.linalg.solve(np.eye(n) - field, np.eye(n) + field)
+    system = jm.LinearSystem(A, np.array([[0.0], [0.0], [0.3], [0.0]]))
+    states, inputs = jm.Box(-2 * np.ones(n), 2 * np.ones(n)), jm.Box([-0.5], [0.5])
+    nominal = jm.MPC(system, np.eye(n), 0.01, horizon=N, states=states, inputs=inputs)
+
+    def plan(size, x0):
+        W = jm.Box(-size * jnp.ones(n), size * jnp.ones(n))
+        return jm.mpc.solve_stagewise(replace(nominal, policy="affine", disturbance=W), x0)
+
+    rng, far = np.random.default_rng(0), np.array([1.6, 0.8, 0.0, 0.0])
+    x0s = np.vstack([rng.uniform(-0.7, 0.7, (3, n)), far, far, far])
+    sizes = np.array([0.03, 0.03, 0.03, 0.0, 0.015, 0.03])
+    with enable_x64():
+        plans = jax.jit(jax.vmap(plan))(sizes, x0s)
+        least = jax.tree.map(np.asarray, jm.solve(nominal, far))
+    assert plans.solved.all()
+    costs = np.asarray(plans.cost)[3:]
+    np.testing.assert_allclose(costs[0], least.cost, rtol=1e-8)
+    np.testing.assert_allclose(plans.inputs[3], least.inputs, atol=1e-6)
+    assert np.all(np.diff(costs) > -1e-8)
+    inside = rng.uniform(-1, 1, (1000, N, n))
+    for i, size in enumerate(sizes):
+        one = jax.tree.map(lambda v, i=i: np.asarray(v[i]), plans)
+        x, u = rolled_out(system, one, size * np.concatenate([inside, np.sign(inside)]))
+        assert np.abs(x[:, :-1]).max() <= 2 + 1e-9 and np.abs(u).max() <= 0.5 + 1e-9
+
+
+def test_what_policies_stage_by_stage_do_not_take():
+    three = jm.sets.Zonotope([0.0, 0.0], [[0.1, 0.0, 0.1], [0.0, 0.1, 0.1]])
+    with pytest.raises(ValueError, match="disturbance: has 3 generators of rank 2"):
+        jm.mpc.solve_stagewise(robust("affine", disturbance=three), STATES[0])
+    with pytest.raises(ValueError, match="mpc: policy is 'tube'"):
+        jm.mpc.solve_stagewise(robust("tube"), STATES[0])
+    with pytest.raises(ValueError, match="mpc: of an affine policy is differentiated"):
+        jax.grad(lambda x0: jm.mpc.solve_stagewise(robust("affine"), x0).cost)(jnp.zeros(2))

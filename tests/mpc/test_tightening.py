@@ -160,6 +160,19 @@ def test_plans_keep_all_limits_under_every_sequence():
     assert touched >= 6
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "W", [jm.Box(-0.2, 0.2), jm.Polytope([[1, 1], [-1, 0], [0, -1]], [0.1] * 3)]
+)
+def test_plans_stage_by_stage_are_those_of_the_condensed_problem(W):
+    mpc = robust(disturbance=W)
+    with enable_x64():
+        for x0 in ([-3.0, 1.0], [-4.4, 1.6]):
+            one, two = jm.solve(mpc, x0), jm.mpc.solve_stagewise(mpc, x0)
+            assert one.solved and two.solved
+            np.testing.assert_allclose(two.inputs, one.inputs, atol=1e-7)
+
+
 def test_one_step_is_the_one_step_controllable_set():
     """N = 1: no policy differs from another, and X_1 = X ∩ Pre(terminal set)."""
     last = jm.Box([-2.0, -1.0], [2.0, 1.0])
@@ -288,8 +301,6 @@ def test_refusals(fields, message):
 
 def test_what_knows_no_disturbance_says_so():
     mpc = robust()
-    with pytest.raises(ValueError, match="disturbance is given"):
-        jm.mpc.solve_stagewise(mpc, np.zeros(2))
     with pytest.raises(ValueError, match="nonlinear model"):
         jm.mpc.NonlinearMPC(mpc, SYSTEM).validate()
     with pytest.raises(ValueError, match="set-point"):

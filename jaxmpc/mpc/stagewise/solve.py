@@ -25,10 +25,17 @@ from jax import Array
 from jax.typing import DTypeLike
 
 from jaxmpc.arrays import Reals, all_finite, as_array
-from jaxmpc.checks import fail, require_kind
+from jaxmpc.checks import fail, require_kind, require_memory
 from jaxmpc.mpc.plan import Aim, Plan, WarmStart, answer, checked_aim
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import at, layout, row_count
+from jaxmpc.mpc.stagewise.affine_policies import (
+    affine_plan,
+    answers_disturbances,
+    bytes_needed,
+    is_centred,
+    require_independent_generators,
+)
 from jaxmpc.mpc.stagewise.newton_steps import (
     INTERIOR_STEPS,
     Search,
@@ -47,6 +54,7 @@ from jaxmpc.mpc.stagewise.stages import (
     stage_residuals,
     unconstrained,
 )
+from jaxmpc.mpc.tightening import with_gain, without_disturbance
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.admm import (
     ADMM,
@@ -106,9 +114,17 @@ def solve_stagewise(
     A row of scale 0 counts as one that no input moves: where that is not so, the plan does not
     become SOLVED.
 
+    Disturbances: with policy="tightened" as above. With "affine" (a Box, or a Zonotope of
+    independent generators) plan.feedback is M, found together with the plan by an interior point
+    method whose size does not grow with N² variables (`affine_policies.py`), in float64, from a
+    cold start; solver.newton_steps: at most so many of its steps, None: 60. SOLVED: the policy
+    keeps all rows for every w, and its plan is the one of least cost, both to the tolerance.
+    INACCURATE: it keeps all rows, and may be followed, but is not shown to be the best.
+    ITERATION_LIMIT: neither. It has no derivatives.
+
     `jax.vmap` over x0, references or the arrays of `mpc`, its system's among them. Raises
     ValueError for bad data that can be read, and for what only `solve` supports: Ellipsoids,
-    control horizons, disturbances.
+    control horizons, tubes.
     """
     factor = factor_stages(mpc, solver, scale)
     aim = {"input_reference": input_reference, "previous_input": previous_input}
@@ -125,7 +141,10 @@ def factor_stages(mpc: MPC, solver: ADMM = DEFAULT, scale: Reals | None = None) 
     shape = (rows,) if scale is None else np.shape(as_array(scale))
     if shape != (rows,):
         fail("scale", f"shape {shape}", f"Give ({rows},), one number a row")
-    return _factor(*arrays((mpc, solver.rho, scale)), steps=solver.admm_steps(ADMM_STEPS) > 0)
+    answers = answers_disturbances(mpc)
+    mpc = without_disturbance(mpc) if answers else mpc
+    steps = solver.admm_steps(ADMM_STEPS) > 0 and not answers
+    return _factor(*arrays((mpc, solver.rho, scale)), steps=steps)
 
 
 def checked(mpc: MPC, solver: ADMM) -> MPC:
@@ -135,12 +154,16 @@ def checked(mpc: MPC, solver: ADMM) -> MPC:
     for name, found in (
         ("terminal_set is an Ellipsoid", isinstance(mpc.terminal_set, Ellipsoid)),
         ("control_horizon is given", mpc.control_horizon is not None),
-        ("disturbance is given", mpc.disturbance is not None),
+        ("policy is 'tube'", mpc.disturbance is not None and mpc.policy == "tube"),
     ):
         if found:
             fail("mpc", name, "Stage by stage there is no such thing: use jm.solve")
     mpc = replace(mpc, prestabilise=None)
     mpc.validate()
+    if answers_disturbances(mpc):
+        require_independent_generators(mpc.disturbance)
+        require_memory("horizon", bytes_needed(mpc), "Give fewer steps, or another policy")
+    mpc = with_gain(mpc)
     mpc.require_unique_inputs()  # the recursion divides by R + B'SB
     solver.validate(row_count(layout(mpc)))
     return mpc
@@ -251,8 +274,9 @@ def plan_stages(
     aim = full_aim(mpc, aim, factor.E.dtype)
     if warm_start is not None:
         warm_start = WarmStart.of(warm_start, factor.stages.layout, mpc)
-    mpc = replace(mpc, prestabilise=None)
-    return _plan(*arrays((factor, mpc, solver, aim, warm_start)))
+    mpc = with_gain(replace(mpc, prestabilise=None))
+    given = arrays((factor, mpc, solver, aim, warm_start))
+    return _plan(*given, centred=answers_disturbances(mpc) and is_centred(mpc.disturbance))
 
 
 def full_aim(mpc: MPC, aim: Aim, dtype: DTypeLike) -> Aim:
@@ -265,10 +289,16 @@ def full_aim(mpc: MPC, aim: Aim, dtype: DTypeLike) -> Aim:
     return Aim(x0, spread(aim.states, N + 1, n), spread(aim.inputs, N, m), before)
 
 
-@jax.jit
+@partial(jax.jit, static_argnames="centred")
 @own_modes
 def _plan(
-    factor: StageFactor, mpc: MPC, solver: ADMM, aim: Aim, warm_start: WarmStart | None
+    factor: StageFactor,
+    mpc: MPC,
+    solver: ADMM,
+    aim: Aim,
+    warm_start: WarmStart | None,
+    *,
+    centred: bool,
 ) -> Plan:
     fault = jnp.where(all_finite(aim), factor.fault, jnp.int32(Status.NON_FINITE))
     usable = fault == Status.NOT_RUN
@@ -276,6 +306,8 @@ def _plan(
     # Only cost and slack are read from the problem as given.
     mpc = jax.tree.map(lambda v: jnp.where(usable, v, 0), mpc)
     s = factor.stages.aimed(aim)
+    if answers_disturbances(mpc):
+        return affine_plan(mpc, s, factor.E, fault, solver, aim, centred)
     found = stage_solution(factor, s, solver, warm_start)
     found = replace(found, iterations=jnp.int32(solver.admm_steps(ADMM_STEPS)))
     x = s.of_system(predict(s, found.z))
