@@ -99,8 +99,9 @@ def worst_rows(mpc: jm.MPC, x: np.ndarray, u: np.ndarray) -> float:
 
 def rolled_out(system, plan: jm.mpc.Plan, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return states (K, N+1, n) and inputs (K, N, m) of an affine policy under w (K, N, n)."""
-    u = plan.inputs + np.einsum("kmjp,sjp->skm", plan.feedback, w)
-    x = [np.tile(plan.states[0], (len(w), 1))]
+    start, v, M = (np.asarray(part) for part in (plan.states[0], plan.inputs, plan.feedback))
+    u = v + np.einsum("kmjp,sjp->skm", M, w)
+    x = [np.tile(start, (len(w), 1))]
     for k in range(w.shape[1]):
         x.append(x[-1] @ np.asarray(system.A).T + u[:, k] @ np.asarray(system.B).T + w[:, k])
     return np.stack(x, 1), u
