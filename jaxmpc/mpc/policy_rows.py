@@ -137,7 +137,7 @@ def condensed_plan(mpc: MPC) -> Condensed:
     plain = without_disturbance(mpc)
     if mpc.policy == "affine":
         require_generators(mpc.disturbance)
-        require_memory("horizon", affine_bytes(mpc, found), "Give fewer steps, or another policy")
+        require_memory("horizon", affine_bytes(mpc, found), "Use jm.mpc.solve_stagewise")
         nominal = each = condense(plain)
         if mpc.control_horizon is not None:
             each = condense(replace(plain, control_horizon=None, prestabilise=False))

@@ -494,7 +494,7 @@ def measured_policy(eps: Array, c: Columns, at: Point) -> Pair:
     rows = tight.rows(predict(s, v), v)
     y = jnp.where(jnp.tile(E == 0, 2), bounds.penalty_gradient(rows), y)
     found = conditions(tight, v, y)
-    of_rows, of_plan, (gap, size, terms) = residuals_of(tight, v, y, found)
+    of_rows, of_plan, (gap, size, terms) = residuals_of(tight, jnp.tile(E, 2), v, y, found)
 
     p, y_plan = y[:count] - y[count:], y[:count] + y[count:]
     q = jnp.clip(E * jnp.sum(SIGNS * at.a, axis=0), -p, p)
