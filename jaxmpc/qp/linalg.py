@@ -11,7 +11,8 @@ batch on a CPU is
 * for few rows eliminated in plain XLA operations, LANES matrices side by side: 1.5 to 10 times as
   fast as LAPACK. Roots gain up to 12 rows, solves up to 6, by measurement on both jaxlibs;
 * above, on those jaxlibs, LAPACK calls for some matrices each, a fraction of the work that is
-  spread (TOGETHER), and one call for all where that is safe.
+  spread (TOGETHER), and one call for all where that is safe. SciPy's OpenBLAS works
+  these off; it gets parts of each matrix so small that it uses one thread.
 
 On other devices JAX's batched routines serve. Nested `vmap`s are one batch. All functions here have
 derivatives of any order, forward and reverse (`eigh`: where no eigenvalue is repeated). A matrix
@@ -44,6 +45,10 @@ WAITS = (0, 10, 0) <= JAXLIB < (0, 11, 1)
 LANES = 64
 # Multiplications in a LAPACK call that is not spread: twice as many did not hang, 4 times did.
 TOGETHER = 100_000
+# Entries of right-hand sides from which on OpenBLAS divides a triangular solve between threads, and
+# most rows that it factors in one. Threads wait for each other: on two busy cores 8 ms a call in
+# place of 10 to 40 µs.
+THREADED, ALONE = 1024, 112
 
 
 def namespace(tree: Any) -> Any:
@@ -190,6 +195,7 @@ def batched(
     small: int = 0,
     columns: bool = False,
     together: int = TOGETHER,
+    cpu: Callable | None = None,
 ) -> Callable:
     """Return the function `one` of square matrices (…, n, n) and other arrays, whose `vmap` follows
     the rules above.
@@ -198,19 +204,20 @@ def batched(
     side by side, all arguments and results with the batch as last axis, used up to `small` rows.
     columns: the second argument is right-hand sides (n, k), the batch of which needs one
     factorization where it shares the matrix. together: multiplications in a call, 0 for one matrix
-    a call.
+    a call. cpu: what takes the place of `one` in batches on CPUs.
     """
+    each_on_cpu = one if cpu is None else cpu
 
     def on_cpu(*args: Array) -> Any:
         batch, n = args[0].shape[0], args[0].shape[-1]
         if plain is not None and n <= small:
             return _side_by_side(plain, args)
         if not WAITS:
-            return jax.vmap(one)(*args)
+            return jax.vmap(each_on_cpu)(*args)
         if not isinstance(batch, int):  # a symbolic size, of `jax.export`
-            return lax.map(lambda each: one(*each), args)
+            return lax.map(lambda each: each_on_cpu(*each), args)
         size = together // (n * n * max(n, args[-1].shape[-1]))
-        return lax.map(lambda each: one(*each), args, batch_size=min(max(size, 1), batch))
+        return lax.map(lambda each: each_on_cpu(*each), args, batch_size=min(max(size, 1), batch))
 
     @custom_vmap
     def many(*args: Array) -> Any:
@@ -304,10 +311,46 @@ def _solve_plain(K: Array, B: Array) -> Array:
 _cholesky_lapack = partial(lax.linalg.cholesky, symmetrize_input=False)
 
 
+def _cholesky_in_blocks(K: Array) -> Array:
+    """By halves, until one thread of OpenBLAS factors them."""
+    n = len(K)
+    if n <= ALONE:
+        return _cholesky_lapack(K)
+    h = n // 2
+    L = _cholesky_in_blocks(K[:h, :h])
+    X = _in_parts(_triangular_lapack, L, K[h:, :h].T).T
+    rest = _cholesky_in_blocks(K[h:, h:] - matmul(X, X.T))
+    return jnp.block([[L, jnp.zeros((h, n - h), K.dtype)], [X, rest]])
+
+
+def _triangular_lapack(L: Array, B: Array) -> Array:
+    return lax.linalg.triangular_solve(L, B, left_side=True, lower=True)
+
+
+def _transposed_lapack(L: Array, B: Array) -> Array:
+    return lax.linalg.triangular_solve(L, B, left_side=True, lower=True, transpose_a=True)
+
+
+def _in_parts(solve: Callable, L: Array, B: Array) -> Array:
+    """Return solve(L, B) by calls with as many columns as one thread of OpenBLAS solves for."""
+    n, k = B.shape
+    width = max((THREADED - 1) // max(n, 1), 1)
+    count = -(-k // width)
+    if count <= 1:
+        return solve(L, B)
+    parts = jnp.pad(B, ((0, 0), (0, count * width - k))).reshape(n, count, width)
+    X = solve(jnp.broadcast_to(L, (count, n, n)), jnp.moveaxis(parts, 1, 0))
+    return jnp.moveaxis(X, 0, 1).reshape(n, -1)[:, :k]
+
+
 def _solve_lapack(K: Array, B: Array) -> Array:
     L = _cholesky_lapack(K)
-    half = lax.linalg.triangular_solve(L, B, left_side=True, lower=True)
-    return lax.linalg.triangular_solve(L, half, left_side=True, lower=True, transpose_a=True)
+    return _transposed_lapack(L, _triangular_lapack(L, B))
+
+
+def _solve_in_blocks(K: Array, B: Array) -> Array:
+    L = _cholesky_in_blocks(K)
+    return _in_parts(_transposed_lapack, L, _in_parts(_triangular_lapack, L, B))
 
 
 def _cholesky_plain(K: Array) -> Array:
@@ -325,8 +368,11 @@ def inverse_root_side_by_side(K: Array) -> Array:
 
 
 def _inverse_root_lapack(K: Array) -> Array:
-    L = _cholesky_lapack(K)
-    return _triangular_lapack(L, jnp.eye(len(K), dtype=K.dtype))
+    return _triangular_lapack(_cholesky_lapack(K), jnp.eye(len(K), dtype=K.dtype))
+
+
+def _inverse_root_in_blocks(K: Array) -> Array:
+    return _triangular_in_parts(_cholesky_in_blocks(K), jnp.eye(len(K), dtype=K.dtype))
 
 
 def _triangular_plain(L: Array, B: Array) -> Array:
@@ -335,14 +381,18 @@ def _triangular_plain(L: Array, B: Array) -> Array:
     return _substituted(flipped, D, B[::-1])[::-1]
 
 
-def _triangular_lapack(L: Array, B: Array) -> Array:
-    return lax.linalg.triangular_solve(L, B, left_side=True, lower=True)
+def _triangular_in_parts(L: Array, B: Array) -> Array:
+    return _in_parts(_triangular_lapack, L, B)
 
 
-_solve = batched(_solve_lapack, _solve_plain, small=6, columns=True)
-_cholesky = batched(_cholesky_lapack, _cholesky_plain, small=12)
-_inverse_root = batched(_inverse_root_lapack, inverse_root_side_by_side, small=12)
-_triangular = batched(_triangular_lapack, _triangular_plain, small=6, columns=True)
+_solve = batched(_solve_lapack, _solve_plain, small=6, columns=True, cpu=_solve_in_blocks)
+_cholesky = batched(_cholesky_lapack, _cholesky_plain, small=12, cpu=_cholesky_in_blocks)
+_inverse_root = batched(
+    _inverse_root_lapack, inverse_root_side_by_side, small=12, cpu=_inverse_root_in_blocks
+)
+_triangular = batched(
+    _triangular_lapack, _triangular_plain, small=6, columns=True, cpu=_triangular_in_parts
+)
 _general = batched(jnp.linalg.solve, columns=True)
 _eigh = batched(lambda K: tuple(jnp.linalg.eigh(K)), together=0)
 

@@ -1,5 +1,7 @@
 """Factorizations and solves in batches: values, derivatives, and no LAPACK call for a batch."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -104,3 +106,29 @@ def test_an_indefinite_matrix_is_nan_alone(n):
         found = jax.vmap(FUNCTIONS[name][0])(jnp.asarray(K), jnp.asarray(B))
         bad = [bool(jnp.any(jnp.isnan(part))) for part in found]
         assert bad == [False, True, False, False]
+
+
+@pytest.mark.parametrize("n", [40, 130])
+def test_openblas_gets_parts_that_one_thread_works_off(n):
+    """Its threads wait for each other. Values, and NaN where a matrix is indefinite alone."""
+    K, B = matrices(4, n, k=n)
+    K[1, -1, -1] = -1.0
+    names = "solve_triangular", "cholesky", "inverse_root", "solve"
+    with jax.enable_x64(True):
+        every = jax.jit(jax.vmap(lambda K, B: [FUNCTIONS[name][0](K, B) for name in names]))
+        program = every.lower(K, B).compile()
+        found = program(K, B)
+    for name, values in zip(names, found, strict=True):
+        for i in (0, 2, 3):
+            expected = FUNCTIONS[name][1](K[i], B[i])
+            np.testing.assert_allclose(values[i], expected, rtol=1e-8, atol=1e-10)
+        assert name == "solve_triangular" or np.isnan(values[1]).any()
+    call = r"f64\[(?:\d+,)*(\d+),(\d+)\][^\n]*custom_call_target=\"lapack_d(potrf|trsm)_ffi"
+    calls = re.findall(call, program.as_text())
+    assert {name for *_, name in calls} == {"potrf", "trsm"}
+    for rows, columns, name in calls:
+        rows, columns = int(rows), int(columns)
+        if name == "potrf":
+            assert rows <= linalg.ALONE
+        else:
+            assert rows * columns < linalg.THREADED
