@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from jaxmpc.arrays import Reals, host_array
-from jaxmpc.checks import fail, require_finite, require_shape
+from jaxmpc.checks import fail, require_finite, require_kind, require_shape
 from jaxmpc.closed_loop.simulation import Run
 from jaxmpc.closed_loop.stored_runs import StoredRuns
 from jaxmpc.files import versions
@@ -131,6 +131,7 @@ def summarise_runs(
     runs: of `simulate_into`, or of `simulate_many`, with a batch axis. tolerance: see
     `evaluate_runs`. With runs of a store the summary has their settings and the time they took.
     """
+    require_kind("robot", robot, Robot)
     run = (runs.run if isinstance(runs, StoredRuns) else runs).on_host()
     outcome = evaluate_runs(run, robot, reference, tolerance=tolerance)
     names = robot.state_names

@@ -42,7 +42,7 @@ class LinearPlant:
             fail("system", f"is a {type(self.system).__name__}", "Give a jm.LinearSystem")
         self.system.validate()
         if self.system.dt is None:
-            fail("system.dt", "is None", "Give the sampling period in seconds")
+            fail("system.dt", "is None", "Give the sampling period, in seconds or in time_unit")
         self.state_limits.validate("state_limits", self.n)
         self.input_limits.validate("input_limits", self.m)
 

@@ -23,10 +23,11 @@ _DELAY = (
 
 
 def require_period(argument: str, dt: Any) -> None:
-    """Raise unless `dt` is a positive finite Python number (seconds)."""
+    """Raise unless `dt` is a positive finite Python number."""
     number = isinstance(dt, Real) and not isinstance(dt, bool)
     if not (number and np.isfinite(dt) and dt > 0):
-        fail(argument, f"{dt!r} is not a positive number", "Give the sampling period in seconds")
+        cure = "Give the sampling period, in seconds or in time_unit"
+        fail(argument, f"{dt!r} is not a positive number", cure)
 
 
 @pytree

@@ -42,7 +42,7 @@ FILES = ("summary.json", "runs.png", "robots.gif")
 # Options that go with a problem file.
 LINEAR = "config count seconds spread seed horizon disturbance output overwrite".split()
 # Defaults of options that --config can give too.
-USUAL = {"horizon": 20, "margin": 0.02, "linearize": "state", "rho": 1e4}
+USUAL = {"seconds": 2.0, "horizon": 20, "margin": 0.02, "linearize": "state", "rho": 1e4}
 # Seconds between frames of the video.
 FRAME = 0.04
 
@@ -70,7 +70,8 @@ class Simulate(SimulateOptions):
         file = {} if self.config is None else configs.load_robot_config(self.config).weights(robot)
         target = None if self.target is None else np.array(self.target)
         reference, input_reference = robot_references(robot, target)
-        steps = max(1, round(self.seconds / robot.dt))
+        seconds: Any = command.seconds
+        steps = max(1, round(seconds / robot.dt))
         each = 256 if jax.default_backend() == "cpu" else 4096
         chunk = self.chunk or (self.devices or 1) * each
         open_folder(self.output)
@@ -78,7 +79,7 @@ class Simulate(SimulateOptions):
             wait.begin(f"closed loops of {robot.name}", programs=1)
             mpc = command.problem(robot, target, file)
             starts, factors = draw_robots(robot, **arguments(self, draw_robots, leave=("robot",)))
-            length = f"{self.seconds:g} {robot.time_unit}"
+            length = f"{seconds:g} {robot.time_unit}"
             print(f"{robot.name}: {self.count:,} robots for {length} -> {self.output}")
             with jax.enable_x64(self.dtype == "float64"):
                 runs = simulate_into(
@@ -142,7 +143,8 @@ class Simulate(SimulateOptions):
 
     def require_sizes(self, robot: Robot) -> None:
         """Raise ValueError where the runs, or the condensed problem, do not fit into memory."""
-        samples, n, m = self.seconds / robot.dt, robot.n, robot.m
+        seconds: Any = self.seconds
+        samples, n, m = seconds / robot.dt, robot.n, robot.m
         each = np.dtype(self.dtype).itemsize * (robot.state_size + m + 3) + 2
         needed, folder, horizon = self.count * samples * each, self.output, self.horizon
         require_memory("--count, --seconds", needed, "Simulate fewer robots, or for less time")

@@ -21,16 +21,19 @@ from jaxmpc.qp.status import Status
 from jaxmpc.sets.limits import row_violations, rows_kept
 
 FILES = ("summary.json", "runs.npz")
+# Samples of a closed loop unless a time is given.
+SAMPLES = 100
 
 
 @dataclasses.dataclass(frozen=True)
 class LinearLoops:
-    """Closed loops from `count` random states over `seconds`: starts are uniform in the middle part
-    `spread` of the state limits. disturbance: None, or a kind of `simulate_problem`."""
+    """Closed loops from `count` random states over `seconds`, in the system's unit of time, or of
+    SAMPLES samples where that is None: starts are uniform in the middle part `spread` of the state
+    limits. disturbance: None, or a kind of `simulate_problem`."""
 
     config: configs.Config
     count: int
-    seconds: float
+    seconds: float | None
     spread: float
     seed: int
     disturbance: str | None
@@ -38,6 +41,8 @@ class LinearLoops:
     @property
     def steps(self) -> int:
         """Number of time steps."""
+        if self.seconds is None:
+            return SAMPLES
         return max(1, round(self.seconds / self.config.system.dt))
 
     def starts(self) -> np.ndarray:
@@ -128,7 +133,7 @@ def simulate_problem(loops: LinearLoops, output: Path, overwrite: bool) -> None:
         ("with a plan", f"{planned.sum():,} of {loops.count:,} starts; the rest counts no further"),
         ("limits kept", f"{kept.sum():,} of {planned.sum():,} loops"),
         ("worst", f"{worst:.3g} beyond a state limit, in its unit"),
-        ("plans solved", f"{100 * solved:.2f} %"),
+        ("plans solved", f"{100 * solved:.2f} %" if planned.any() else "none"),
         ("cost", "none" if cost is None else f"{cost:.6g}, mean of the loops with a plan"),
         ("files", " ".join(str(output / name) for name in FILES)),
     ]

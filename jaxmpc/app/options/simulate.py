@@ -99,8 +99,10 @@ class SimulateOptions:
     ] = None
     count: Annotated[int, option("B", "64"), at_least(1)] = 64
     """Number of robots."""
-    seconds: Annotated[float, option("S", "2"), POSITIVE] = 2.0
-    """Simulated time of each robot."""
+    seconds: Annotated[float | None, option("S", "2; of a problem file 100 samples"), POSITIVE] = (
+        None
+    )
+    """Simulated time of each robot, or in the unit of time of a problem file."""
     disturbance: Annotated[
         Disturbances | None,
         option(

@@ -19,11 +19,12 @@ from jaxmpc.app.plots.style import (
     Style,
     patch,
 )
-from jaxmpc.checks import counted, fail
+from jaxmpc.checks import counted, fail, require_kind
 from jaxmpc.closed_loop.outcome import with_limits
 from jaxmpc.closed_loop.simulation import Run
 from jaxmpc.qp.status import Status
 from jaxmpc.robots.description import host_coordinates
+from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.robot import Robot
 from jaxmpc.sets.limits import rows_kept
 
@@ -53,8 +54,11 @@ def plot_runs(
     reference (n,), input_reference (m,): set-points to draw, or over time as `simulate` takes them.
     robots: which of the batch to draw, 24 at most by default. title: None: counts of loops and
     plans, of all of the batch. The figure has another size by its `set_size_inches`. Raises
-    ValueError for robots that are not there.
+    ValueError for robots that are not there, and for plants that have no limits.
     """
+    require_kind("run", run, Run, cure="Give what simulate or simulate_many returns")
+    lacks = "Give jm.LinearPlant(system, states, inputs), which has limits to draw"
+    require_kind("plant", plant, Robot, LinearPlant, cure=lacks)
     run = run.on_host()
     inputs, plans = np.asarray(run.inputs), plan_outcomes(run)
     count, samples = inputs.shape[:2]
