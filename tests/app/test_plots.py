@@ -14,6 +14,7 @@ from jaxmpc.app.plots import plot_body, plot_feasible_set, plot_recursion, plot_
 from jaxmpc.app.plots.closed_loops import plot_before_after, plot_runs
 from jaxmpc.app.plots.style import FEASIBLE, INFEASIBLE
 from jaxmpc.app.plots.tuning import plot_maps, plot_solver, plot_trade_off, plot_tuning
+from jaxmpc.closed_loop.outcome import summarise_runs
 from jaxmpc.closed_loop.simulation import Run
 from jaxmpc.recursion.counterexamples import Counterexample, SampledLoops
 from jaxmpc.recursion.proofs import Claim
@@ -352,6 +353,18 @@ def test_what_has_nothing_to_draw_is_refused():
     fmap = SimpleNamespace(axis_names=("a", "b", "c"), inner=lambda: None, outer=lambda: None)
     with pytest.raises(ValueError, match="has no bounded body to draw"):
         plot_body(fmap)
+
+
+def test_loops_that_cannot_be_drawn_are_named():
+    system, zeros = LinearSystem(np.eye(1), np.ones((1, 1)), dt=0.5), np.zeros((1, 6))
+    plant = LinearPlant(system, Box([-1], [1]), Box([-1], [1]))
+    run = Run(np.zeros((1, 7, 1)), np.zeros((1, 6, 1)), *[zeros] * 6)
+    with pytest.raises(ValueError, match="plant: is a LinearSystem. Give jm.LinearPlant"):
+        plot_runs(run, system)
+    with pytest.raises(ValueError, match="run: is a tuple. Give what simulate"):
+        plot_runs((), plant)
+    with pytest.raises(ValueError, match="robot: is a LinearPlant. Give a"):
+        summarise_runs(run, plant, np.zeros(1), np.zeros(1))
 
 
 @pytest.mark.parametrize("finite", [0, 1, 2, 9])
