@@ -54,6 +54,16 @@ def test_links():
         assert (ROOT / target).exists(), target
 
 
+def test_architecture_names_every_file_of_a_room():
+    page = (ROOT / "docs/architecture.md").read_text()
+    for room, text in re.findall(r"^\| `([a-z_/]+)` \| (.*) \|$", page, re.M):
+        files = {path.stem for path in (ROOT / "jaxmpc" / room).glob("*.py")} - {"__init__"}
+        names = set(re.findall(r"`(\w+)`", text))
+        assert files <= names, (room, files - names)
+        folders = {path.name for path in (ROOT / "jaxmpc" / room).iterdir()} | {"feasible"}
+        assert names <= files | folders, (room, names - files)
+
+
 def test_names_at_the_top_level():
     """The pages of the reference say which of their names are there, their index all of them."""
     table = re.findall(
