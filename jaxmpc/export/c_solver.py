@@ -218,11 +218,29 @@ class ClosedLoopCheck:
     input_error_any: float
 
 
+# State and input to track, as `Controller` takes them.
+Target = tuple[Any, Any]
+
+
 def require_box(mpc: MPC, lower: Any, upper: Any) -> None:
     """Raise ValueError where the corners of a box of states are not (n,) finite numbers each."""
     for argument, bound in (("lower", lower), ("upper", upper)):
         require_shape(argument, bound, (mpc.system.n,), "Give a number for each state")
         require_finite(argument, bound)
+
+
+def target_of(mpc: MPC, reference: Reals | None, input_reference: Reals | None) -> Target:
+    """Return the target of closed loops; ValueError for references of other shapes."""
+
+    def checked(argument: str, value: Reals | None, size: int) -> np.ndarray | None:
+        if value is None:
+            return None
+        require_shape(argument, value, (size,), "Give one number each: where the loops stay")
+        require_finite(argument, value)
+        return host_array(argument, value)
+
+    n, m = mpc.system.n, mpc.system.m
+    return checked("reference", reference, n), checked("input_reference", input_reference, m)
 
 
 def solved_by_code(plan: Plan, tolerance: Any) -> Any:
@@ -233,20 +251,22 @@ def solved_by_code(plan: Plan, tolerance: Any) -> Any:
 
 
 @jax.jit  # compiled once for all controllers of a problem
-def _controls(controller: Controller, states: Any, before: Any) -> Any:
+def _controls(controller: Controller, states: Any, before: Any, target: Target) -> Any:
     """Return inputs (B, m) and statuses (B,) of plans from states (B, n) after inputs (B, m)."""
-    found = jax.vmap(lambda x, u: controller(x, previous_input=u))(states, before)
+    x_aim, u_aim = target
+    one = lambda x, u: controller(x, None, x_aim, input_reference=u_aim, previous_input=u)
+    found = jax.vmap(one)(states, before)
     return found.u, found.plan.status
 
 
 def _precise_plans(
-    controller: Controller, states: np.ndarray, before: np.ndarray
+    controller: Controller, states: np.ndarray, before: np.ndarray, target: Target
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return `_controls` in parts of one shape, the last one filled up with its last state."""
     parts = []
     for i in range(0, len(states), DRAWN):
         part = np.arange(i, i + DRAWN).clip(max=len(states) - 1)
-        parts.append(_controls(controller, states[part], before[part]))
+        parts.append(_controls(controller, states[part], before[part], target))
     u, status = (
         np.concatenate([np.asarray(v) for v in column]) for column in zip(*parts, strict=True)
     )
@@ -254,11 +274,12 @@ def _precise_plans(
 
 
 def starting_states(
-    controller: Controller, lower: np.ndarray, upper: np.ndarray, seed: int
+    controller: Controller, lower: np.ndarray, upper: np.ndarray, seed: int, target: Target
 ) -> np.ndarray:
     """Return random states (`LOOPS`, n) of a box, such that have a plan where there are some."""
     starts = np.random.default_rng(seed).uniform(lower, upper, (DRAWN, len(lower)))
-    _, status = _precise_plans(controller, starts, np.zeros((DRAWN, controller.mpc.system.m)))
+    before = np.zeros((DRAWN, controller.mpc.system.m))
+    _, status = _precise_plans(controller, starts, before, target)
     return starts[np.argsort(status != Status.SOLVED, kind="stable")[:LOOPS]]
 
 
@@ -270,6 +291,9 @@ def check_fixed_steps(
     plans: int = 1000,
     tolerance: float = 1e-6,
     seed: int = 0,
+    *,
+    reference: Reals | None = None,
+    input_reference: Reals | None = None,
 ) -> ClosedLoopCheck:
     """Run `Controller(mpc, solver)` with newton_steps=0 from random states of the box [lower,
     upper] (n,), and at each state solve the plan precisely too.
@@ -277,9 +301,11 @@ def check_fixed_steps(
     20 closed loops begin at states that have a plan.
 
     lower, upper: corners (n,) of the box. plans: how many, rounded up to a multiple of 20.
-    tolerance: as in `export_c`.
+    tolerance: as in `export_c`. reference (n,), input_reference (m,): state and input that the
+    loops track, such as those of `equilibrium`; None: zero.
 
-    Raises ValueError for an invalid problem, bounds of another shape than (n,) and bad counts.
+    Raises ValueError for an invalid problem, bounds and references of another shape, and bad
+    counts.
     """
     require_kind("mpc", mpc, MPC, cure=GIVE_PROBLEM)
     require_untraced("mpc", mpc)
@@ -292,13 +318,14 @@ def check_fixed_steps(
         lower, upper = host_array("lower", lower), host_array("upper", upper)
         fixed = Controller(mpc, replace(solver, newton_steps=0, eps=tolerance))
         precise = Controller(mpc, ADMM())
-        starts = starting_states(precise, lower, upper, seed)
+        target = target_of(mpc, reference, input_reference)
+        starts = starting_states(precise, lower, upper, seed, target)
         A, B = (jnp.asarray(host_array("system", v)) for v in (mpc.system.A, mpc.system.B))
         drift = 0.0 if mpc.system.c is None else jnp.asarray(host_array("system.c", mpc.system.c))
 
         def step(state: Any, _: Any) -> Any:
             x, before = state
-            control = fixed(x, before)
+            control = fixed(x, before, target[0], input_reference=target[1])
             after = matmul(A, x) + matmul(B, control.u) + drift
             solved = solved_by_code(control.plan, tolerance)
             return (after, control), (x, before.u, control.u, solved)
@@ -308,7 +335,7 @@ def check_fixed_steps(
 
         loops = (np.asarray(v) for v in jax.jit(jax.vmap(loop))(starts))
         x, before, u, solved = (v.reshape(-1, *v.shape[2:]) for v in loops)
-        best_u, best = _precise_plans(precise, x, before)
+        best_u, best = _precise_plans(precise, x, before, target)
         error = np.abs(u - best_u).max(axis=1)
     solvable = best == Status.SOLVED
     both = solvable & solved

@@ -20,10 +20,12 @@ from jaxmpc.checks import number, require_kind, require_untraced, whole
 from jaxmpc.export.c_files import GIVE_PROBLEM
 from jaxmpc.export.c_solver import (
     LOOPS,
+    Target,
     check_fixed_steps,
     require_box,
     solved_by_code,
     starting_states,
+    target_of,
 )
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.policy_rows import PolicyCondensed
@@ -51,6 +53,8 @@ def choose_steps(
     tolerance: float = 1e-6,
     seed: int = 1,
     progress: bool = False,
+    reference: Reals | None = None,
+    input_reference: Reals | None = None,
 ) -> ADMM:
     """Return the solver for `export_c` whose fixed steps solve most plans of closed loops.
 
@@ -61,7 +65,8 @@ def choose_steps(
     that are looked at. tolerance: as in `export_c`. seed: of the initial states; those by which
     `check_fixed_steps` then measures the result are others. progress: print each number of
     iterations that is tried on stderr, with the share that it solves. Each is another program,
-    which compiles for half a minute on two cores.
+    which compiles for half a minute on two cores. reference (n,), input_reference (m,): state and
+    input that the loops track, such as those of `equilibrium`; None: zero.
 
     The penalties are local optima of a coarse search: `tune_solver` finds better ones. Raises
     ValueError as `check_fixed_steps` does.
@@ -76,7 +81,8 @@ def choose_steps(
     with jax.enable_x64(True):
         precise = Controller(mpc, ADMM())
         corners = host_array("lower", lower), host_array("upper", upper)
-        starts = starting_states(precise, *corners, seed)
+        target = target_of(mpc, reference, input_reference)
+        starts = starting_states(precise, *corners, seed, target)
         layout = precise.condensed.layout
         kinds = np.repeat(np.arange(len(layout)), [len(ks) * size for _, ks, size in layout])
         rho, alpha = np.asarray(precise.factor.rho)[0], ADMM().alpha
@@ -94,13 +100,14 @@ def choose_steps(
             make = lambda rho, steps=steps: Controller(
                 mpc, ADMM(steps, rho, alpha, newton_steps=0, eps=tolerance)
             )
-            rho, reached = _improved(make, starts, -(-plans // LOOPS), rho, kinds)
+            rho, reached = _improved(make, starts, target, -(-plans // LOOPS), rho, kinds)
             solver = ADMM(steps, rho, alpha, newton_steps=0)
             say(f"{steps:,} iterations solve {reached:.1%} of the plans")
             if iterations is not None or reached >= share or steps >= MOST:
                 return solver
             # Not every plan need have a solution: then precise plans say how many have.
-            found = check_fixed_steps(mpc, solver, lower, upper, plans, tolerance, seed)
+            aim = {"reference": reference, "input_reference": input_reference}
+            found = check_fixed_steps(mpc, solver, lower, upper, plans, tolerance, seed, **aim)
             say(f"and {found.reached:,} of the {found.solvable:,} that have a solution")
             if found.reached >= share * found.solvable:
                 return solver
@@ -108,11 +115,17 @@ def choose_steps(
 
 
 def _improved(
-    make: Callable[[Any], Controller], starts: Any, length: int, rho: np.ndarray, kinds: np.ndarray
+    make: Callable[[Any], Controller],
+    starts: Any,
+    target: Target,
+    length: int,
+    rho: np.ndarray,
+    kinds: np.ndarray,
 ) -> tuple[np.ndarray, float]:
     """Return better penalties (rows,) than rho, and the share of plans that they solve.
 
-    make: penalties to controller. length: of the closed loops from `starts`. kinds: of the rows.
+    make: penalties to controller. length: of the closed loops from `starts` to the target. kinds:
+    of the rows.
     """
 
     @jax.jit
@@ -122,7 +135,7 @@ def _improved(
 
         def step(state: Any, _: Any) -> Any:
             x, before = state
-            control = controller(x, before)
+            control = controller(x, before, target[0], input_reference=target[1])
             solved = solved_by_code(control.plan, controller.solver.eps)
             return (system.step(x, control.u), control), solved
 

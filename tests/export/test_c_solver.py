@@ -228,12 +228,34 @@ def test_closed_loop_check():
     assert one.reached < 40
 
 
+@pytest.mark.slow
+def test_closed_loops_to_a_set_point_are_those_of_deviations():
+    """A rest position p = 3: limits and starts about it, and the same about the origin."""
+    about = np.array([3.0, 0.0])
+    there = replace(CHECKED, states=jm.Box([2, -2], [4, 2]))
+    lower, upper, solver = np.array([-0.9, -0.9]), np.array([0.9, 0.9]), jm.ADMM(iterations=30)
+    own = check_fixed_steps(CHECKED, solver, lower, upper, 100)
+    found = check_fixed_steps(
+        there, solver, lower + about, upper + about, 100, reference=about, input_reference=[0.0]
+    )
+    assert 0 < own.reached <= own.solvable <= 100
+    assert (found.solvable, found.reached) == (own.solvable, own.reached)
+    np.testing.assert_allclose(found.input_error, own.input_error, rtol=1e-4)
+    chosen = [
+        choose_steps(mpc, lower + x, upper + x, iterations=30, plans=100, reference=x)
+        for mpc, x in ((CHECKED, 0 * about), (there, about))
+    ]
+    np.testing.assert_array_equal(chosen[0].rho, chosen[1].rho)
+
+
 @pytest.mark.parametrize(
     "changes, message",
     [
         (dict(lower=[0.0]), "lower: "),
         (dict(upper=[np.inf, 1.0]), "upper: "),
         (dict(plans=0), "plans: "),
+        (dict(reference=[1.0]), "reference: shape"),
+        (dict(input_reference=[np.nan]), "input_reference: "),
         (dict(mpc=3), "mpc: "),
     ],
 )
