@@ -53,6 +53,7 @@ class Export(ExportOptions):
                 plans=self.plans,
                 tolerance=tolerance,
                 progress=True,
+                **config.references(),
             )
         if self.law == "explicit":
             print("searching regions", file=sys.stderr)
@@ -88,7 +89,10 @@ class Export(ExportOptions):
         summary |= {"files": [str(path) for path in paths]}
         if self.law == "steps" and self.plans:
             print("checking closed loops; compiling, some 20 s", file=sys.stderr)
-            found = check_fixed_steps(mpc, solver, lower, upper, self.plans, tolerance)
+            box = lower, upper
+            found = check_fixed_steps(
+                mpc, solver, *box, self.plans, tolerance, **config.references()
+            )
             share = 100 * found.reached / max(found.solvable, 1)
             summary |= dataclasses.asdict(found)
             units = set(mpc.system.input_units or ())
