@@ -108,7 +108,7 @@ def is_centred(W: Box | Zonotope) -> bool:
         return False
     if isinstance(W, Box):
         return bool(np.all(np.asarray(W.lower) == -np.asarray(W.upper)))
-    return not np.any(W.center)
+    return not np.any(np.asarray(W.center))
 
 
 def require_independent_generators(W: Any) -> None:
