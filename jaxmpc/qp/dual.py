@@ -294,7 +294,7 @@ def dual_search(
         most = min(every, KERNEL_ROWS)
         point, optimal = dual_search_kernel(dual, cold, point, none, go_on, steps)
     else:
-        most = min(every, MOST_ROWS)
+        most = most_rows(dual.A)
         state = DualSearch(point, none, go_on, jnp.asarray(False))
         step = partial(_search_step, steps, most)
         first = partial(_first_step, steps, min(most, FIRST_ROWS))

@@ -318,7 +318,7 @@ def _cholesky_in_blocks(K: Array) -> Array:
         return _cholesky_lapack(K)
     h = n // 2
     L = _cholesky_in_blocks(K[:h, :h])
-    X = _in_parts(_triangular_lapack, L, K[h:, :h].T).T
+    X = _triangular_in_parts(L, K[h:, :h].T).T
     rest = _cholesky_in_blocks(K[h:, h:] - matmul(X, X.T))
     return jnp.block([[L, jnp.zeros((h, n - h), K.dtype)], [X, rest]])
 
@@ -343,6 +343,10 @@ def _in_parts(solve: Callable, L: Array, B: Array) -> Array:
     return jnp.moveaxis(X, 0, 1).reshape(n, -1)[:, :k]
 
 
+def _triangular_in_parts(L: Array, B: Array) -> Array:
+    return _in_parts(_triangular_lapack, L, B)
+
+
 def _solve_lapack(K: Array, B: Array) -> Array:
     L = _cholesky_lapack(K)
     return _transposed_lapack(L, _triangular_lapack(L, B))
@@ -350,7 +354,7 @@ def _solve_lapack(K: Array, B: Array) -> Array:
 
 def _solve_in_blocks(K: Array, B: Array) -> Array:
     L = _cholesky_in_blocks(K)
-    return _in_parts(_transposed_lapack, L, _in_parts(_triangular_lapack, L, B))
+    return _in_parts(_transposed_lapack, L, _triangular_in_parts(L, B))
 
 
 def _cholesky_plain(K: Array) -> Array:
@@ -379,10 +383,6 @@ def _triangular_plain(L: Array, B: Array) -> Array:
     flipped = L[::-1, ::-1]
     D = jnp.stack([flipped[i, i] for i in range(L.shape[0])])
     return _substituted(flipped, D, B[::-1])[::-1]
-
-
-def _triangular_in_parts(L: Array, B: Array) -> Array:
-    return _in_parts(_triangular_lapack, L, B)
 
 
 _solve = batched(_solve_lapack, _solve_plain, small=6, columns=True, cpu=_solve_in_blocks)

@@ -89,9 +89,8 @@ class Export(ExportOptions):
         summary |= {"files": [str(path) for path in paths]}
         if self.law == "steps" and self.plans:
             print("checking closed loops; compiling, some 20 s", file=sys.stderr)
-            box = lower, upper
             found = check_fixed_steps(
-                mpc, solver, *box, self.plans, tolerance, **config.references()
+                mpc, solver, lower, upper, self.plans, tolerance, **config.references()
             )
             share = 100 * found.reached / max(found.solvable, 1)
             summary |= dataclasses.asdict(found)
