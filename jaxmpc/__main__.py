@@ -24,12 +24,11 @@ def main() -> int:
 def session(words: Sequence[str]) -> Iterator[None]:
     """Keep what the command in `words` compiles, and start JAX's device beside the imports of its
     modules; nothing of this for wrong options, which are told at once."""
-    from jaxmpc.app.program_cache import KEEPING, kept_programs
+    from jaxmpc.app.program_cache import KEEPING, defaults, kept_programs
 
     # By SciPy's OpenBLAS, not imported yet, JAX factors small matrices, for which its threads wait
     # on busy cores far longer than one takes.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    with kept_programs(words):
+    with defaults(OPENBLAS_NUM_THREADS="1"), kept_programs(words):
         if words[0] in KEEPING:
             threading.Thread(target=_start_device).start()
         yield

@@ -50,12 +50,24 @@ def programs_folder() -> Path | None:
 
 
 @contextlib.contextmanager
+def defaults(**variables: str) -> Iterator[None]:
+    """Set those of these variables of the environment that are not set, and take them back."""
+    own = {name: value for name, value in variables.items() if name not in os.environ}
+    os.environ.update(own)
+    try:
+        yield
+    finally:
+        for name in own:
+            os.environ.pop(name, None)
+
+
+@contextlib.contextmanager
 def kept_programs(words: Sequence[str]) -> Iterator[None]:
     """Keep the programs that the command in `words` compiles, and use those of earlier runs.
 
-    Sets variables of the environment, which JAX reads when it is imported. Does nothing where
-    JAXMPC_CACHE is "off", where JAX_COMPILATION_CACHE_DIR is set (JAX then keeps programs there),
-    and where the user's cache cannot be written.
+    Sets variables of the environment meanwhile, which JAX reads when it is imported. Does nothing
+    where JAXMPC_CACHE is "off", where JAX_COMPILATION_CACHE_DIR is set (JAX then keeps programs
+    there), and where the user's cache cannot be written.
     """
     own = None
     if words and words[0] in KEEPING and "JAX_COMPILATION_CACHE_DIR" not in os.environ:
@@ -65,20 +77,22 @@ def kept_programs(words: Sequence[str]) -> Iterator[None]:
     if own is None:
         yield
         return
-    os.environ["JAX_COMPILATION_CACHE_DIR"] = str(own)
-    # Small programs too: dozens of them make up seconds.
-    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
-    # XLA's own caches on GPUs are not ours to keep whole.
-    os.environ.setdefault("JAX_PERSISTENT_CACHE_ENABLE_XLA_CACHES", "none")
+    variables = {
+        "JAX_COMPILATION_CACHE_DIR": str(own),
+        # Small programs too: dozens of them make up seconds.
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+        # XLA's own caches on GPUs are not ours to keep whole.
+        "JAX_PERSISTENT_CACHE_ENABLE_XLA_CACHES": "none",
+    }
     warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache")
     given = {path.name for path in own.iterdir()}
     try:
-        yield
+        with defaults(**variables):
+            yield
     finally:
         with contextlib.suppress(OSError):
             _end(own, given)
         shutil.rmtree(own, ignore_errors=True)
-        del os.environ["JAX_COMPILATION_CACHE_DIR"]
 
 
 def _begin(folder: Path) -> Path:

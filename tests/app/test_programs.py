@@ -203,9 +203,12 @@ def test_results_are_the_same_with_and_without():
 
 
 def test_a_command_has_one_thread_of_openblas_unless_another_count_is_given(monkeypatch):
+    """And leaves the environment of the process as it was."""
     for given, wanted in ((None, "1"), ("3", "3")):
-        monkeypatch.delenv("OPENBLAS_NUM_THREADS")
+        monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
         if given:
             monkeypatch.setenv("OPENBLAS_NUM_THREADS", given)
+        before = dict(os.environ)
         with session(["info"]):
             assert os.environ["OPENBLAS_NUM_THREADS"] == wanted
+        assert dict(os.environ) == before
