@@ -24,6 +24,7 @@ u_0 − u_{−1}, is known and not tightened; the others lose what K (e_k − e_
 e_k = A_K e_{k−1} + E w, e_{k−1} in S and w in W.
 """
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -53,6 +54,8 @@ from jaxmpc.sets.minimal_invariant import minimal_robust_invariant_set
 LARGE = 1e30
 # Numbers that the solver holds for each of (rows + variables)², about.
 MATRICES = 4
+# Generators of a tube's cross-section from which on maps and polytopes take minutes.
+MANY = 300
 
 
 @pytree
@@ -178,7 +181,14 @@ def tube_section(mpc: MPC) -> Zonotope:
     found = minimal_robust_invariant_set(
         plant, gain, mpc.disturbance, disturbance_matrix=mpc.disturbance_matrix
     )
-    return found.to_zonotope()
+    section = found.to_zonotope()
+    count = section.generators.shape[1]
+    if count > MANY:
+        what = f"'tube' with a cross-section of {count:,} generators, each of them a variable"
+        cure = 'A gain that damps faster has fewer, policy="tightened" none'
+        text = f"policy: {what}: plans take seconds, maps and polytopes minutes. {cure}"
+        warnings.warn(text, stacklevel=2)
+    return section
 
 
 def causal_entries(N: int, m: int, p: int) -> np.ndarray:

@@ -1,5 +1,6 @@
 """MPC against theorems and stacked, sparse and Riccati constructions that share no code with it."""
 
+import warnings
 from dataclasses import replace
 
 import chex
@@ -14,6 +15,7 @@ from jax import enable_x64
 import jaxmpc as jm
 from jaxmpc.mpc.condense import condense
 from jaxmpc.mpc.plan import WarmStart
+from jaxmpc.mpc.policy_rows import tube_section
 
 FINE = jm.ADMM(iterations=400, newton_steps=30, eps=1e-8)
 PLAIN = jm.ADMM(iterations=1000, newton_steps=0)  # compiles fastest
@@ -634,3 +636,32 @@ def test_a_float64_controller_outside_64_bit_mode_is_refused():
         controller(np.zeros(2))
     with jax.enable_x64(True):
         assert controller(np.zeros(2)).u.dtype == np.float64
+
+
+@pytest.mark.parametrize("call", [jm.solve, jm.solve_many, jm.Controller])
+def test_dense_problems_that_take_long_or_do_not_fit_are_told_before_any_compile(monkeypatch, call):
+    """1,200 steps of two states and an input, with limits of all: 1,200 variables, 3,600 rows."""
+    monkeypatch.setattr("jaxmpc.mpc.controller._factor", None)
+    long = replace(problems.lecture(), horizon=1200, terminal_set=None)
+    given = {jm.solve: (np.zeros(2),), jm.solve_many: (np.zeros((3, 2)),)}.get(call, ())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(UserWarning, match=r"horizon: 1,200 .* 3,600 .* s\. .*solve_stagewise"):
+            call(long, *given)
+    monkeypatch.setattr("jaxmpc.checks.available_memory", lambda: 5e8)
+    with pytest.raises(ValueError, match=r"horizon: .* needs 737.3 MB .*solve_stagewise"):
+        call(long, *given)
+
+
+def test_a_tube_with_many_generators_is_told():
+    """Of a loop that damps by 0.97 a step hundreds of steps count: S is the sum of A_K^k W."""
+    turn = np.array([[np.cos(1.0), np.sin(1.0)], [-np.sin(1.0), np.cos(1.0)]])
+    slow = jm.LinearSystem(A=0.97 * turn, B=np.eye(2))
+    small = jm.Box([-1e-3, -1e-3], [1e-3, 1e-3])
+    mpc = jm.MPC(
+        slow, np.eye(2), np.eye(2), horizon=2, inputs=jm.Box([-1, -1], [1, 1]), policy="tube",
+        disturbance=small, gain=np.zeros((2, 2)),
+    )  # fmt: skip
+    with pytest.warns(UserWarning, match=r"policy: .* generators, .*damps faster"):
+        section = tube_section(mpc)
+    assert section.generators.shape[1] > 300
