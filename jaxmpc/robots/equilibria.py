@@ -26,6 +26,8 @@ AT_REST = 1e-3
 # Weights of the distance in the search, one after the other; the last leaves balanced forces.
 _WEIGHTS = (1e-2, 1e-4, 1e-6, 1e-9, 1e-12)
 _STEP = 1e-6
+# Where searches begin, one after the other: shares of the way to home.
+_STARTS = (0.0, 0.25, 0.5, 0.75, 1.0)
 # Steps of Newton's method for the springs of couplings, and accelerations at which it ends.
 _SETTLING, _SETTLED = 10, 1e-9
 # Configurations tried, further and further inside the limits, where couplings yield beyond them.
@@ -418,10 +420,25 @@ def nearest_rest(robot: RobotDescription, q: np.ndarray) -> Rest:
 
     Minimises |forces|² + w |motion|² over motions from q inside the position limits and drives
     inside theirs, for weights w that fall to almost nothing: a local search, whose end is a local
-    minimum of the distance. Forces are scaled by the largest one at q, motions by rad or m.
+    minimum of the distance, or of forces that nothing balances. Then it begins again, nearer and
+    nearer to home. Forces are scaled by the largest one at q, motions by rad or m.
     """
-    forces = Forces(robot)
-    J, f = forces.affine(q)
+    forces, home = Forces(robot), np.zeros(robot.predictor.model.nv)
+    mujoco.mj_differentiatePos(forces.model, home, 1.0, q, robot.home[: len(q)])
+    rests = list[Rest]()
+    for share in _STARTS:
+        rests.append(_searched(robot, forces, q, share * home))
+        if rests[-1].held or not home.any():
+            break
+    return min(rests, key=lambda rest: (not rest.held, float(np.abs(rest.missing).max())))
+
+
+def _searched(robot: RobotDescription, forces: Forces, q: np.ndarray, motion: np.ndarray) -> Rest:
+    """Return where the search of `nearest_rest` ends that begins at a motion (nv,) from q (nq,)."""
+    size = 1 + float(np.abs(forces.affine(q)[1]).max())
+    start = q.copy()
+    mujoco.mj_integratePos(forces.model, start, motion, 1.0)
+    J, f = forces.affine(start)
     drive = np.linalg.lstsq(J, -f, rcond=None)[0]
     low, high = _room(forces.model, robot.state_limits, q)
     lower, upper = np.append(low, forces.lower), np.append(high, forces.upper)
@@ -429,8 +446,8 @@ def nearest_rest(robot: RobotDescription, q: np.ndarray) -> Rest:
     lower, upper = lower - narrow, upper + narrow
     width = upper - lower
     inset = np.where(np.isfinite(width), 1e-10 * np.where(np.isfinite(width), width, 0), 1e-10)
-    near = Neighbourhood(forces, q, 1 + float(np.abs(f).max()), np.maximum(1.0, np.abs(drive)))
-    z = np.clip(np.append(np.zeros(len(low)), drive), lower + inset, upper - inset)
+    near = Neighbourhood(forces, q, size, np.maximum(1.0, np.abs(drive)))
+    z = np.clip(np.append(motion, drive), lower + inset, upper - inset)
     tight = {"xtol": 1e-14, "ftol": 1e-14, "gtol": 1e-14, "max_nfev": 50}
     scale = np.append(np.ones(len(low)), near.width)
     for weight in _WEIGHTS:

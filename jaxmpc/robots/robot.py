@@ -152,21 +152,27 @@ class Robot(RobotDescription):
         body that stands on the ground. It names the coordinates that lack a force. Also where the
         file moves there in MuJoCo: force limits, couplings, contacts or stops take the rest away.
         """
+        stands = hasattr(self.predictor, "feet")
         if near is not None:
             if q is not None:
                 fail("near", "is given beside q", "Give one of them")
             require_shape("near", near, (self.mujoco.nq,), "One configuration, as in qpos")
+            if stands:
+                what = "is given for a robot that stands, whose feet hold it where they are at home"
+                fail("near", what, "Give q, a configuration with the feet in their places")
             rest = nearest_rest(self, self.configurations("near", near))
             if not rest.held:
                 missing = "no configuration that can be held was found from there: "
-                cure = "Start elsewhere, or give the robot what holds it"
+                cure = "Start elsewhere, or give the robot what holds it (`standing` on feet)"
                 fail("near", missing + lacking(self, rest), cure)
             require_rest("near", self, [rest])
             return rest.x, rest.u
         q = self.configurations("q", self.home[: self.mujoco.nq] if q is None else q)
         self._require_coupled(q)
         rests = [rest_at(self, row) for row in q.reshape(-1, q.shape[-1])]
-        cure = "Choose a configuration that the actuators hold, or search with near="
+        cure = "Choose a configuration that the actuators hold, or search for one: near=q without q"
+        if stands:
+            cure = "Choose another configuration, or give more torque, or feet with more friction"
         for rest in rests:
             if not rest.balanced:
                 missing = f"no input balances the forces; {lacking(self, rest)}"

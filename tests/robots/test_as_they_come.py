@@ -66,6 +66,14 @@ def test_the_nearest_configuration_that_can_be_held():
     x, u = jm.load_robot("cartpole").equilibrium(near=[0.3, 0.5])
     np.testing.assert_allclose(x, [0.3, 0, 0, 0], atol=1e-6)
     np.testing.assert_allclose(u, [0], atol=1e-6)
+    # Beyond the stops at ±π/2 gravity is stationary: no small motion needs less torque.
+    x, u = jm.load_robot("pendulum").equilibrium(near=[-4.0])
+    np.testing.assert_allclose(x, [-np.arcsin(5 / 9.81), 0], atol=1e-6)
+    hung = jm.load_robot("quadrotor")  # upside down, where rotors push it into the ground
+    x, u = hung.equilibrium(near=[0.0, 0, 1, 0, 1, 0, 0])
+    data = data_at(hung.mujoco, x, u)
+    mujoco.mj_forward(hung.mujoco, data)
+    np.testing.assert_allclose(data.qacc, 0, atol=1e-5)
     arm = jm.load_robot("arm2", torque=([-3.0, -1.0], [3.0, 1.0]))
     x, u = arm.equilibrium(near=arm.home[:2])
     assert np.all(np.abs(u) <= [3, 1]) and np.abs(x - arm.home).max() > 0.1

@@ -180,8 +180,10 @@ def test_weak_motors_hold_no_robot(quadruped):
     bounds = [(0, None)] * 20 + [(-1, 1)] * model.nu
     found = linprog(np.zeros(32), A_eq=parts, b_eq=data.qfrc_bias, bounds=bounds)
     assert found.status == 2
-    with pytest.raises(ValueError, match="no input balances the forces"):
+    with pytest.raises(ValueError, match="no input balances the forces.*feet with more friction"):
         weak.equilibrium()
+    with pytest.raises(ValueError, match="near: is given for a robot that stands"):
+        weak.equilibrium(near=robot.home[: model.nq])
     with pytest.raises(ValueError, match="cannot stand at home"):
         weak.set_point()
 
