@@ -21,9 +21,10 @@ from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.grids import grid
 from jaxmpc.mpc.condense import in_float64
 from jaxmpc.mpc.controller import Controller
+from jaxmpc.mpc.plan import checked_aim
 from jaxmpc.mpc.policy_rows import condensed_plan
 from jaxmpc.mpc.problem import HARD, MPC, harden
-from jaxmpc.mpc.rows import row_table
+from jaxmpc.mpc.rows import given_blocks, row_table
 from jaxmpc.mpc.tightening import feedback_gain
 from jaxmpc.pytrees import record
 from jaxmpc.qp.admm import ADMM
@@ -33,8 +34,11 @@ from jaxmpc.recursion.report import RecursionReport
 from jaxmpc.recursion.time_budget import LABELS, LOOPS, PROOFS, Budget
 from jaxmpc.sets.convex_sets import Box
 from jaxmpc.sets.terminal_hypotheses import TerminalReport, verify_terminal
+from jaxmpc.systems.system import host_matrices
 
 T = TypeVar("T")
+# Rounding of a set-point, relative: drifts and violations below that are none.
+RESTS = 1e-9
 # Rounding of optimal values, relative: a Lyapunov increase below that is none.
 ROUNDING = 1e-7
 
@@ -46,8 +50,9 @@ class NominalLoops:
     x0s (B, n). steps: time steps of each loop. feasible: number of loops whose plans were all
     SOLVED; the other fields are of these. violation: the worst of the state limits, in their units.
     slack: the worst violation of soft rows. increase: the largest V(x⁺) − V(x) + x'Qx + u'Ru
-    relative to V(x); worst_x0: the start of the loop in which it was met. left: largest |x_T| of a
-    loop, relative to the largest of its start, each state in units of its size among the starts.
+    relative to V(x); worst_x0: the start of the loop in which it was met. left: largest distance
+    of x_T from the set-point, relative to that of the start of the loop, each state in units of its
+    distance among the starts.
     """
 
     x0s: np.ndarray
@@ -65,7 +70,7 @@ class NominalLoops:
             f"{self.steps} steps",
             f"worst violation of a hard state limit {self.violation:.3g}, "
             f"of a soft row {self.slack:.3g}",
-            f"largest state left, relative to the start: {self.left:.3g}",
+            f"largest distance left to the set-point, relative to the start: {self.left:.3g}",
         ]
         if self.increase <= ROUNDING and np.isfinite(self.increase):
             what = "Lyapunov decrease V(x+) - V(x) <= -(x'Qx + u'Ru): kept on every step, margin"
@@ -79,13 +84,73 @@ class NominalLoops:
 
 
 @record
+class SetPoint:
+    """Where closed loops are to go: x (n,) under u (m,).
+
+    drift (n,): A x + B u + c − x, zero where u holds x. broken: the limits that x and u do not keep
+    for ever, by name, hard ones and soft ones.
+    """
+
+    x: np.ndarray
+    u: np.ndarray
+    drift: np.ndarray
+    broken: tuple[str, ...]
+
+    @classmethod
+    def of(cls, mpc: MPC, reference: Reals | None, input_reference: Reals | None) -> "SetPoint":
+        """Return a set-point with what there is to say of it; None stands for zero."""
+        aim = checked_aim(mpc, np.zeros(mpc.system.n), reference, input_reference)
+        x, u = (
+            np.zeros(size) if v is None else np.asarray(v, float)
+            for v, size in ((aim.states, mpc.system.n), (aim.inputs, mpc.system.m))
+        )
+        if x.ndim == 2 or u.ndim == 2:
+            fail("reference", "differs over time", "The report is about one set-point")
+        A, B, c = host_matrices(mpc.system)
+        drift = A @ x + B @ u + c - x
+        size = np.abs(A) @ np.abs(x) + np.abs(B) @ np.abs(u) + np.abs(c) + np.abs(x)
+        drift = np.where(np.abs(drift) <= RESTS * size, 0.0, drift)
+        found: list[str] = []
+        with jax.enable_x64(True):
+            limits = given_blocks(jax.tree.map(np.float64, mpc), float)
+        for b in limits:
+            v = 0 * u if b.rate else u
+            along = np.tile(x, (mpc.horizon + 1, 1)), np.tile(v, (mpc.horizon, 1))
+            value, low, high = np.asarray(b.values(*along)), b.lower, b.upper
+            if b.radius is not None:
+                value, low, high = np.sqrt(np.sum(value**2)), -b.radius, b.radius
+            end = np.where(value > high, high, low)
+            beyond = np.maximum(value - high, low - value)
+            over = np.broadcast_to(beyond > RESTS * np.abs(end), (len(b.steps), b.size))
+            kind = "soft limit" if b.linear is not None else f"{b.kind} limit"
+            found += [
+                f"{kind} {name}" for name, out in zip(b.names, over.any(axis=0), strict=True) if out
+            ]
+        return cls(x, u, drift, tuple(dict.fromkeys(found)))
+
+    def __str__(self) -> str:
+        put = lambda v: np.array2string(v, precision=6, separator=", ")
+        text = [f"x = {put(self.x)}, u = {put(self.u)}"]
+        if np.any(self.drift):
+            text.append(f"no equilibrium: x moves by {put(self.drift)} a step")
+        for name in self.broken:
+            text.append(f"breaks the {name}")
+        if not np.any(self.drift) and not self.broken:
+            text.append("an equilibrium that keeps all limits")
+        text.append("closed loops go there; of the optimal law (its claim, its penalty), and of")
+        text.append("stability, the report speaks as of the law whose set-point is the origin")
+        return "\n".join(text)
+
+
+@record
 class OfflineReport:
     """Everything that is known of an MPC problem before it runs; `print` shows it.
 
     feasible_set: map of initial states with proofs, of the problem with its soft rows hard; volume:
     lower and upper bound of its volume. recursion, penalty, terminal: the reports of
-    `recursive_feasibility`, `exact_penalty` and `verify_terminal`. loops: closed loops that were
-    simulated, not proved. None, where they do not apply or the time was over.
+    `recursive_feasibility`, `exact_penalty` and `verify_terminal`, of the law whose set-point is
+    the origin. loops: closed loops to set_point that were simulated, not proved. None, where they
+    do not apply or the time was over.
     notes: the reasons for what is None.
     variables, rows, condition: sizes of the condensed QP and condition number of its Hessian, of
     the variables that have a cost.
@@ -102,6 +167,7 @@ class OfflineReport:
     rows: int
     condition: float
     notes: dict[str, str]
+    set_point: SetPoint
 
     def __str__(self) -> str:
         mpc, system = self.mpc, self.mpc.system
@@ -125,8 +191,10 @@ class OfflineReport:
             samples = f"{size}samples: {known}"
             if len(mpc.labels) > 3:
                 samples += "\nstates of the caller or random ones: not shares of the volume"
+        away = self.set_point.x.any() or self.set_point.u.any()
         sections = (
             ("Problem", problem, ""),
+            *([("Set-point", self.set_point, "")] if away else []),
             ("Feasible set (limits hard)", samples, "feasible_set"),
             ("Recursive feasibility (limits hard)", self.recursion, "recursion"),
             ("Exact penalty", self.penalty, "penalty"),
@@ -147,6 +215,8 @@ def offline_report(
     x0s: Reals | None = None,
     *,
     K: Reals | None = None,
+    reference: Reals | None = None,
+    input_reference: Reals | None = None,
     steps: int = 50,
     loops: int = 128,
     seconds: float = 120.0,
@@ -163,6 +233,9 @@ def offline_report(
             map, and in more than three dimensions to follow in the recursion test. None: a grid
             over the feasible set, in more than three dimensions random points of its bounding box;
             those of `recursive_feasibility` for its test.
+        reference, input_reference: the set-point of closed loops, (n,) and (m,); None for zero. It
+            is shown, with whether it is an equilibrium inside the limits. It moves the optimal
+            law: what is said of that beyond the closed loops is said of the origin as set-point.
         steps: length of the closed loops. loops: how many of them.
         K: terminal law to verify, (m, n); None: that of the LQR.
         seconds: time limit of the whole call. Linear programs take seconds, thousands of facets or
@@ -185,6 +258,7 @@ def offline_report(
     mpc.require_constant("the report is about the same problem at every time step", *HARD)
     for name, value, least in (("steps", steps, 2), ("loops", loops, 1)):
         whole(name, value, least)
+    set_point = SetPoint.of(mpc, reference, input_reference)
     hard = harden(mpc)
     problem = problem_of(hard)
     notes: dict[str, str] = {}
@@ -214,7 +288,7 @@ def offline_report(
     else:
         budget.say(f"closed loops; compile for some {LOOPS:.0f} s")
         pick = np.unique(np.linspace(0, len(inside) - 1, min(loops, len(inside))).astype(int))
-        followed = nominal_loops(mpc, inside[pick], steps)
+        followed = nominal_loops(mpc, inside[pick], steps, set_point)
     with jax.enable_x64(True):
         condensed = condensed_plan(in_float64(mpc))
     P = np.asarray(condensed.P)
@@ -231,6 +305,7 @@ def offline_report(
         rows=condensed.C.shape[0],
         condition=float(np.linalg.cond(P[np.ix_(costly, costly)])),
         notes=notes,
+        set_point=set_point,
     )
 
 
@@ -316,8 +391,8 @@ def limits_text(mpc: MPC) -> str:
     return "\n".join(lines) or "no limits"
 
 
-def nominal_loops(mpc: MPC, x0s: np.ndarray, steps: int) -> NominalLoops:
-    """Simulate nominal closed loops in float64.
+def nominal_loops(mpc: MPC, x0s: np.ndarray, steps: int, set_point: SetPoint) -> NominalLoops:
+    """Simulate nominal closed loops to a set-point in float64.
 
     x0s: states (B, n), or (B, n + m) with the previous input where input rates are limited.
     """
@@ -329,7 +404,15 @@ def nominal_loops(mpc: MPC, x0s: np.ndarray, steps: int) -> NominalLoops:
 
         def loop(x0: jax.Array) -> Run:  # x, or (x, u_{−1}) where input rates are limited
             previous = x0[n:] if len(x0) > n else None
-            return simulate(controller, mpc.system, x0[:n], steps, previous_input=previous)
+            return simulate(
+                controller,
+                mpc.system,
+                x0[:n],
+                steps,
+                reference=set_point.x,
+                input_reference=set_point.u,
+                previous_input=previous,
+            )
 
         run = jax.jit(jax.vmap(loop))(x0s)
         change = np.asarray(lyapunov_decrease(run))
@@ -338,10 +421,11 @@ def nominal_loops(mpc: MPC, x0s: np.ndarray, steps: int) -> NominalLoops:
     scale = np.abs(run.cost[:, :-1]) + 1e-12
     relative = np.where(solved[:, None], change / scale, -np.inf)
     worst = np.unravel_index(np.argmax(relative), relative.shape)
-    # Largest state of each loop, in units of its size among the starts.
-    size = np.abs(x0s[:, :n]).max(axis=0)
+    # Largest distance of each loop, in units of those of the starts.
+    apart = [x - set_point.x for x in (x0s[:, :n], run.states[:, -1])]
+    size = np.abs(apart[0]).max(axis=0)
     size = np.where(size > 0, size, 1.0)
-    first, last = (np.abs(x / size).max(axis=1) for x in (x0s[:, :n], run.states[:, -1]))
+    first, last = (np.abs(x / size).max(axis=1) for x in apart)
     return NominalLoops(
         x0s=x0s,
         steps=steps,

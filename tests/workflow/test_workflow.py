@@ -10,6 +10,7 @@ import jaxmpc as jm
 from jaxmpc.app.cli import main
 from jaxmpc.feasible.map import map_points
 from jaxmpc.feasible.problem import FeasibilityProblem
+from jaxmpc.workflow.offline_checks import SetPoint
 
 
 def test_design_builds_what_its_parts_say():
@@ -130,3 +131,24 @@ def test_report_of_an_ellipsoidal_and_of_a_4d_problem():
     product = jm.workflow.offline_report(problems.hidden_product(3), steps=3, loops=8, seconds=20)
     assert product.feasible_set.counts()["undecided"] == 0 and product.loops.feasible <= 8
     assert "random ones: not shares of the volume" in str(product)
+
+
+def test_a_report_says_where_its_loops_go_and_whether_that_holds():
+    """A double integrator rests at any position without an input, and at no other velocity."""
+    system = jm.LinearSystem([[1, 1], [0, 1]], [[0.5], [1]], c=[0, 0.5], dt=1.0)
+    states, soft = jm.Box([-5, -5], [5, 5]), jm.Soft([[1, 0]], upper=[2], names=("reach",))
+    mpc = jm.MPC(system, 1.0, 1.0, 3, states=states, inputs=jm.Box(-1, 1), soft=soft)
+    mpc = replace(mpc, Q=np.eye(2))
+    for x, u, drift, broken in (
+        ([1, 0], [-0.5], [-0.25, 0], ()),  # c alone is not balanced: x⁺ − x = (u/2, u + 1/2)
+        ([6, 0], [-1.5], [-0.75, -1], ("input limit u1", "state limit x1", "soft limit reach")),
+        ([1, 2], [0.0], [2, 0.5], ()),
+    ):
+        found = SetPoint.of(mpc, x, u)
+        np.testing.assert_allclose(found.drift, drift)
+        assert found.broken == broken and "no equilibrium" in str(found)
+    straight = replace(mpc, system=replace(system, c=None))
+    report = jm.workflow.offline_report(straight, reference=[1.0, 0.0], steps=2, seconds=1)
+    assert "Set-point\n  x = [1., 0.], u = [0.]\n  an equilibrium that keeps" in str(report)
+    with pytest.raises(ValueError, match="reference: differs over time"):
+        jm.workflow.offline_report(straight, reference=np.zeros((4, 2)))

@@ -30,6 +30,7 @@ class Info(InfoOptions):
             loops=self.loops,
             seconds=self.seconds,
             progress=True,
+            **config.references(),
         )
         print(f"{config.name}\n\n{report}")
         if self.html is not None:
@@ -55,6 +56,7 @@ def record(report: OfflineReport) -> dict[str, Any]:
         "loops": None,
     }
     entries = lambda part, *names: {name: getattr(part, name) for name in names}
+    found["set_point"] = entries(report.set_point, "x", "u", "drift", "broken")
     if report.feasible_set is not None:
         found["feasible_set"] = {"counts": report.feasible_set.counts()}
     if report.recursion is not None:

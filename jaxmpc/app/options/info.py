@@ -45,7 +45,8 @@ class InfoOptions:
                  Ctrl-C.
 
     What the TOML file holds
-      The sections [system], [limits], [cost], [mpc] of jaxmpc sweep --help.
+      The sections [system], [limits], [cost], [mpc] of jaxmpc sweep --help, and [reference], the
+      set-point of the closed loops: the report says whether it rests inside the limits.
     """
 
     config: ProblemFile = None
