@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import enable_x64
-from problems import residuals, rows_of, symmetric
+from problems import lecture, residuals, rows_of, symmetric
 
 import jaxmpc as jm
 from jaxmpc.mpc.plan import Aim, WarmStart
@@ -373,3 +373,20 @@ def test_bad_arguments_raise():
         solve_stagewise(mpc, X0, np.zeros((N, n)))
     with pytest.raises(ValueError, match="rho"):
         factor_stages(mpc, jm.ADMM(rho=np.ones(3)))
+
+
+@pytest.mark.parametrize(
+    "given, message",
+    [
+        ({"x0": np.zeros(3)}, r"x0: shape \(3,\)"),
+        ({"x0": ["a", 0]}, "x0: "),
+        ({"x0": np.zeros(2), "reference": np.zeros(3)}, r"reference: shape \(3,\)"),
+        ({"x0": np.zeros(2), "input_reference": np.zeros((2, 1))}, "input_reference: shape"),
+        ({"x0": np.zeros(2), "warm_start": 3}, "warm_start: "),
+    ],
+)
+def test_wrong_arguments_are_told_before_the_factorization(monkeypatch, given, message):
+    """It compiles for seconds."""
+    monkeypatch.setattr("jaxmpc.mpc.stagewise.solve._factor", None)
+    with pytest.raises(ValueError, match=message):
+        jm.mpc.solve_stagewise(lecture(), **given)

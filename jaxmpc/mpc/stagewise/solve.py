@@ -26,7 +26,7 @@ from jax.typing import DTypeLike
 
 from jaxmpc.arrays import Reals, all_finite, as_array
 from jaxmpc.checks import fail, require_kind, require_memory
-from jaxmpc.mpc.plan import Aim, Plan, WarmStart, answer, checked_aim
+from jaxmpc.mpc.plan import Aim, Plan, WarmStart, answer, checked_aim, require_warm_start
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import at, layout, row_count
 from jaxmpc.mpc.stagewise.affine_policies import (
@@ -126,6 +126,10 @@ def solve_stagewise(
     ValueError for bad data that can be read, and for what only `solve` supports: Ellipsoids,
     control horizons, tubes.
     """
+    require_kind("mpc", mpc, MPC)
+    mpc.require_sizes()
+    checked_aim(mpc, x0, reference, input_reference, previous_input)  # before any compile
+    require_warm_start(warm_start)
     factor = factor_stages(mpc, solver, scale)
     aim = {"input_reference": input_reference, "previous_input": previous_input}
     return plan_stages(factor, mpc, x0, reference, solver, warm_start, **aim)
