@@ -151,8 +151,9 @@ def examine(
     if mpc.disturbance is not None:
         return _report(_robust(claims, verdict), None, lost, loops, budget)
     if not budget.affords(PROOFS):
-        budget.say("the time is over before a counterexample is proved")
-        return _report(_open(claims, verdict, None), None, lost, loops, budget)
+        needed = budget.sufficient(PROOFS + LABELS + PLANS)
+        budget.say(f"the time is over before a counterexample is proved: give {needed} s")
+        return _report(_open(claims, verdict, None), None, lost, loops, budget, needed)
 
     bound, starts = outer_bound(claims)
     samples = given
@@ -174,9 +175,10 @@ def examine(
         budget.say(f"proof of the counterexample; compiles for some {PROOFS:.0f} s")
         by = ["regions"] * len(verdict.worst)
         worst = certified(region_law, problem, bound, verdict.worst, by)
-    compiles, ascents = LABELS + (0.0 if complete else PLANS), 0
+    compiles, ascents, needed = LABELS + (0.0 if complete else PLANS), 0, 0
     if not budget.affords(compiles):
-        budget.say(f"no samples: they compile for some {compiles:.0f} s, which are not left")
+        needed = budget.sufficient(compiles)
+        budget.say(f"no samples: they compile for some {compiles:.0f} s, so give {needed} s")
     else:
         what = f"closed loops of {steps} steps from {len(samples):,} samples"
         budget.say(f"{what}; compile for some {compiles:.0f} s")
@@ -197,8 +199,8 @@ def examine(
             if worst is None or (other is not None and other.distance > worst.distance):
                 worst = other
     if worst is None:
-        return _report(_open(claims, verdict, loops, ascents), None, lost, loops, budget)
-    return _report(_refuted(claims, worst), worst, lost, loops, budget)
+        return _report(_open(claims, verdict, loops, ascents), None, lost, loops, budget, needed)
+    return _report(_refuted(claims, worst), worst, lost, loops, budget, needed)
 
 
 def _search_starts(
@@ -260,6 +262,7 @@ def _report(
     lost_by_law: float,
     loops: SampledLoops,
     budget: Budget,
+    needed: int = 0,
 ) -> RecursionReport:
     """Return the report of all that was found."""
     body = claims.feasible_set
@@ -275,6 +278,7 @@ def _report(
         lost_by_law=lost_by_law,
         loops=loops,
         seconds=budget.spent,
+        needed=needed,
     )
 
 

@@ -36,7 +36,8 @@ class RecursionReport:
     lost_by_any: volume of the part from which every first input leaves X_N. lost_by_law: of that
     from which the optimal one does, from critical regions.
     loops: from the sample states, none where the law is proved and no states were given, or without
-    time.
+    time. seconds: that the call took. needed: where loops were left out for want of time, the
+    seconds with which there are some; else 0.
     """
 
     mpc: MPC
@@ -50,6 +51,7 @@ class RecursionReport:
     lost_by_law: float
     loops: SampledLoops
     seconds: float
+    needed: int = 0
 
     @property
     def claims(self) -> dict[str, Claim]:
@@ -79,6 +81,9 @@ class RecursionReport:
                 rows.append((f"- {name.replace('one', '1')}", f"{count:>10,}  {share}"))
         else:
             rows.append(("samples", f"none: {self._why_no_samples()}"))
+        if self.needed:
+            what = "or more of recursive feasibility, for closed loops and what they compile"
+            rows.append(("seconds needed", f"{self.needed} {what}"))
         return "\n".join(f"  {name:<20} {value}" for name, value in rows)
 
     __repr__ = __str__
@@ -164,6 +169,7 @@ def save_report(
         "counts": loops.counts(),
         "steps": loops.steps,
         "seconds": report.seconds,
+        "needed": report.needed,
         "config": config,
         "sha256": sha256(arrays),
         "versions": versions(),

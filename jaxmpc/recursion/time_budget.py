@@ -1,5 +1,6 @@
 """The time that a call may take, and what it says on stderr meanwhile."""
 
+import math
 import sys
 import time
 from dataclasses import dataclass
@@ -45,6 +46,12 @@ class Budget:
     def affords(self, seconds: float) -> bool:
         """Return whether so many seconds are left."""
         return self.deadline - time.monotonic() >= seconds
+
+    def sufficient(self, seconds: float) -> int:
+        """Return a time limit, in whole seconds, under which so many would be left here: stages
+        before take the time that they took, or the share of the limit, three quarters at most."""
+        share = min(self.spent / (self.deadline - self.begun), 0.75)
+        return math.ceil(max(self.spent + seconds, seconds / (1 - share)))
 
     @property
     def bar(self) -> bool:

@@ -1,6 +1,7 @@
 """Recursive feasibility: every claim against exact polygons, closed forms or known answers."""
 
 import dataclasses
+import time
 from dataclasses import replace
 from fractions import Fraction
 
@@ -326,7 +327,7 @@ class TestReport:
     @pytest.mark.slow
     def test_worst_is_a_vertex_of_a_region(self, monkeypatch, problem, distance, lost, search):
         """A search can end elsewhere (in 12 s at 0.527 on the first). Nor are samples needed."""
-        monkeypatch.setattr(analysis, "LABELS", np.inf)  # no time for samples
+        monkeypatch.setattr(analysis, "LABELS", 1e9)  # no time for samples
         mpc = problem()
         report = recursive_feasibility(mpc, search=search)
         assert holds(report) == (False, False, False) and len(report.loops.x0s) == 0
@@ -355,7 +356,7 @@ class TestReport:
 
     def test_some_regions_already_refute(self, monkeypatch):
         """What is lost is not known then, nor how far outside the worst state leads."""
-        monkeypatch.setattr(analysis, "LABELS", np.inf)  # no time for samples, nor for a search
+        monkeypatch.setattr(analysis, "LABELS", 1e9)  # no time for samples, nor for a search
         report = recursive_feasibility(problems.lecture(0.25, 3), max_regions=5)
         assert report.law.holds is False and np.isnan(report.lost_by_law)
         assert 0.01 < report.counterexample.distance <= 0.0474341650
@@ -369,10 +370,21 @@ class TestReport:
         np.testing.assert_array_equal(report.loops.label, [0, 0])
         np.testing.assert_array_equal(report.loops.lost_at, [-1, -1])
         assert "time" in report.law.reason and report.seconds < 20
+        assert report.needed >= 32 and f"seconds needed       {report.needed} or more" in str(
+            report
+        )
         assert "theorem and linear programs" in capsys.readouterr().err
         found = smallest_horizon(mpc, 50, seconds=0.01, progress=True)
         assert len(found.reasons) <= 1
         assert "horizon 1\n" in capsys.readouterr().err
+
+    def test_seconds_that_suffice(self):
+        """A call that took 10 of 1,000 s and needs 32 more has them with 42; one of whose limit two
+        thirds were spent, by stages that may take their share again, with three times as many."""
+        now = time.monotonic()
+        assert Budget(now - 10, now + 990, False).sufficient(32) == 43  # rounded up
+        assert Budget(now - 20, now + 10, False).sufficient(32) in (96, 97)
+        assert Budget(now - 40, now - 10, False).sufficient(32) == 128
 
     def test_closed_loops_stop_in_time(self):
         mpc, over = problems.lecture(), Budget(0.0, -np.inf, False)
