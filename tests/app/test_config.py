@@ -124,7 +124,7 @@ def test_axes_by_name_index_and_slice(write):
         ("[[1.0], [0.5]]", "[[1.0]]", "system.B: has 1 entries"),
         ("Q = [1.0, 2.0]", "Q = [1.0, -2.0]", "Q: is not positive semidefinite"),
         ("Q = [1.0, 2.0]", 'Q = "big"', "cost.Q"),
-        ("R = [1.0]", 'R = [1.0]\nP = "riccati"', "cost.P.*'lqr'"),
+        ("R = [1.0]", 'R = [1.0]\nP = "riccati"', 'cost.P: .riccati. where "lqr", .* rows of'),
         ("grid = [3, 4]", "grid = []", "sweep.grid"),
         ("grid = [3, 4]", "grid = [3, 1]", "sweep.grid"),
         ("grid = [3, 4]", "grid = [3]", "sweep.grid: has 1 entries where 2"),

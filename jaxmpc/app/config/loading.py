@@ -4,9 +4,10 @@ import dataclasses
 import math
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, get_args
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
@@ -186,10 +187,51 @@ def _error_message(error: ValidationError, whole: Any) -> str:
     if first["type"] == "dataclass_type":
         return f"{key}: is no section. Write [{key}] above its keys"
     same = [e for e in error.errors() if place(e) == where]
+    forms = _forms(_annotation(whole, where))
+    if forms and all(e["type"] in _OF_TYPES for e in same):
+        given = same[0]["input"]
+        meant = nearest(given, [f.strip('"') for f in forms]) if isinstance(given, str) else ""
+        *others, last = forms
+        needed = f"{', '.join(others)} or {last}" if others else last
+        return f"{key}: {shown(given)} where {needed} is needed. {meant}".rstrip()
     problems = dict.fromkeys(e["msg"].removeprefix("Value error, ") for e in same)
     # TOML and the help say list, Python tuple.
     text = "; or ".join(problems).replace("tuple", "list").replace("Tuple", "List")
     return f"{key}: {text}. Got {shown(first['input'])}"
+
+
+# Kinds of errors that a value of another type gives, in pydantic's words.
+_OF_TYPES = tuple(f"{kind}_type" for kind in "float int bool string tuple".split())
+_OF_TYPES = (*_OF_TYPES, "literal_error", "int_from_float", "int_parsing", "float_parsing")
+# Types of values in words.
+_WORDS = {float: "a number", int: "a whole number", bool: "true or false", str: "a text"}
+
+
+def _annotation(whole: Any, where: Sequence[str]) -> Any:
+    """Return the type of a key, None where there is none."""
+    for name in where:
+        kinds = [whole, *get_args(whole)]
+        known = next((kind for kind in kinds if dataclasses.is_dataclass(kind)), None)
+        fields = {} if known is None else {f.name: f.type for f in dataclasses.fields(known)}
+        whole = fields.get(name)
+    return whole
+
+
+def _forms(kind: Any) -> list[str]:
+    """Return what a value of a type may be, in words; [] where there are none for it."""
+    origin, parts = get_origin(kind), get_args(kind)
+    if origin is Literal:
+        return [f'"{word}"' for word in parts]
+    if origin is Annotated:
+        return _forms(parts[0])
+    if origin is tuple:
+        # [a number] → a list of numbers, [a list of numbers] → a list of rows of numbers.
+        rows = [f.replace("a list of", "rows of") for f in _forms(parts[0])]
+        many = [f if f.startswith("rows") else f"{f.removeprefix('a ')}s" for f in rows]
+        return [f"a list of {' or '.join(many)}"] if many else []
+    if origin in (Union, UnionType):
+        return [form for part in parts if part is not NoneType for form in _forms(part)]
+    return [_WORDS[kind]] if kind in _WORDS else []
 
 
 def _unknown_key(where: list[str], whole: Any) -> str:
