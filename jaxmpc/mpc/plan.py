@@ -490,6 +490,9 @@ def active_constraints(
     y = np.asarray(flat_multipliers(layout(mpc), plan.multipliers), np.float64)
     if int(plan.status) in NO_SOLUTION:
         what = f"is {Status(int(plan.status)).name}, so that no limit shapes it"
+        at_once = broken_at_start(mpc, np.asarray(plan.states[0]))
+        if at_once:
+            fail("plan", f"{what}: x0 has {' and '.join(at_once)}", "Start inside, or soften it")
         cure = "Ask jm.solve(jm.soften(mpc, rho=1e3), x0) which limits it breaks"
         fail("plan", what, cure)
     ball = isinstance(mpc.terminal_set, Ellipsoid)
@@ -506,6 +509,28 @@ def active_constraints(
     if push > tolerance:
         found.append(ActiveConstraint("terminal", "ellipsoid", "", mpc.horizon, "radius", push))
     return tuple(sorted(found, key=lambda constraint: -constraint.multiplier))
+
+
+def broken_at_start(mpc: MPC, x0: np.ndarray) -> list[str]:
+    """Return in words each hard limit that a state x0 (n,) does not keep by itself, such as
+    "dq = 2.5 rad/s, above 2", the worst of them, relative to the limit, first."""
+    found = list[tuple[float, str]]()
+    for b in given_blocks(mpc, float):
+        if b.kind not in ("state", "output") or b.H is None or b.steps[0] != 0:
+            continue
+        if b.D is not None and np.any(b.D):
+            continue
+        H, low, high = (
+            np.asarray(v)[0] if np.ndim(v) > d else np.asarray(v)
+            for v, d in ((b.H, 2), (b.lower, 1), (b.upper, 1))
+        )
+        for i, value in enumerate(H @ x0):
+            end, side = (high[i], "above") if value > high[i] else (low[i], "below")
+            over = max(value - high[i], low[i] - value)
+            if over > 1e-9 * max(abs(end), abs(value)):
+                text = f"{b.names[i]} = {value:.6g} {b.units[i]}".rstrip()
+                found.append((over / max(abs(end), abs(value)), f"{text}, {side} {end:.6g}"))
+    return [text for _, text in sorted(found, key=lambda pair: -pair[0])]
 
 
 def soft_columns(mpc: MPC) -> list[int | None]:

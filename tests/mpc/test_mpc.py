@@ -14,7 +14,7 @@ from jax import enable_x64
 
 import jaxmpc as jm
 from jaxmpc.mpc.condense import condense
-from jaxmpc.mpc.plan import WarmStart
+from jaxmpc.mpc.plan import WarmStart, broken_at_start
 from jaxmpc.mpc.policy_rows import tube_section
 
 FINE = jm.ADMM(iterations=400, newton_steps=30, eps=1e-8)
@@ -665,3 +665,24 @@ def test_a_tube_with_many_generators_is_told():
     with pytest.warns(UserWarning, match=r"policy: .* generators, .*damps faster"):
         section = tube_section(mpc)
     assert section.generators.shape[1] > 300
+
+
+def test_limits_that_a_state_breaks_before_any_input():
+    """By hand: of a plan without a solution, the error about its limits names them, worst first."""
+    system = jm.LinearSystem(
+        [[1, 0.1], [0, 1]], [0, 0.1], state_names=("q", "dq"), state_units=("rad", "rad/s")
+    )
+    mpc = jm.MPC(
+        system, np.eye(2), np.eye(1), 3, states=jm.Box([-1.5, -2], [1.5, 2]),
+        inputs=jm.Box(-1, 1), outputs=jm.Outputs([[1, 1]], upper=[3], names=("sum",)),
+    )  # fmt: skip
+    assert broken_at_start(mpc, np.array([1.5, 1.5])) == []
+    assert broken_at_start(mpc, np.array([1.6, -4])) == [
+        "dq = -4 rad/s, below -2", "q = 1.6 rad, above 1.5"
+    ]  # fmt: skip
+    assert broken_at_start(mpc, np.array([1.5, 1.9])) == ["sum = 3.4, above 3"]
+    assert broken_at_start(replace(mpc, constrain_initial=False), np.array([9.0, 9.0])) == []
+    plan = jm.solve(replace(mpc, outputs=()), np.array([1.6, 0.0]), solver=PLAIN)
+    assert plan.status == jm.Status.PRIMAL_INFEASIBLE
+    with pytest.raises(ValueError, match="x0 has q = 1.6 rad, above 1.5. Start inside"):
+        jm.mpc.active_constraints(replace(mpc, outputs=()), plan)

@@ -15,6 +15,7 @@ from jaxmpc.closed_loop.disturbances import draw_disturbances, worst_disturbance
 from jaxmpc.closed_loop.simulation import Run, simulate
 from jaxmpc.files import as_json, open_folder, versions, write_arrays, write_json
 from jaxmpc.mpc.controller import Controller
+from jaxmpc.mpc.plan import broken_at_start
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.admm import DEFAULT
 from jaxmpc.qp.status import Status
@@ -128,9 +129,12 @@ def simulate_problem(loops: LinearLoops, output: Path, overwrite: bool) -> None:
         "inside": "random points at each step: a sample, no proof",
         "worst": "found by gradient for each start: a local search, no proof",
     }
+    broken = [broken_at_start(mpc, x0) for x0 in x0s[~planned]]
+    outside = [texts[0] for texts in broken if texts]
     rows = [
         ("disturbance", meaning.get(text, "none")),
         ("with a plan", f"{planned.sum():,} of {loops.count:,} starts; the rest counts no further"),
+        *[("- outside", f"{len(outside):,} begin beyond a limit: {text}") for text in outside[:1]],
         ("limits kept", f"{kept.sum():,} of {planned.sum():,} loops"),
         ("worst", f"{worst:.3g} beyond a state limit, in its unit"),
         ("plans solved", f"{100 * solved:.2f} %" if planned.any() else "none"),
