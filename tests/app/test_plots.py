@@ -10,7 +10,14 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from panels import require_no_empty_panel
 
-from jaxmpc.app.plots import plot_body, plot_feasible_set, plot_recursion, plot_robot_map
+import jaxmpc as jm
+from jaxmpc.app.plots import (
+    plot_body,
+    plot_feasible_set,
+    plot_plan,
+    plot_recursion,
+    plot_robot_map,
+)
 from jaxmpc.app.plots.closed_loops import plot_before_after, plot_runs
 from jaxmpc.app.plots.style import FEASIBLE, INFEASIBLE
 from jaxmpc.app.plots.tuning import plot_maps, plot_solver, plot_trade_off, plot_tuning
@@ -403,3 +410,34 @@ def test_a_trade_off_shows_the_front_dominated_points_and_the_start():
     assert lines["dominated"] == [[2.5, 3.0]] and lines["as given"] == [[4.0, 2.0]]
     assert [text.get_text() for text in ax.texts] == ["5:1", "1:1", "1:10"]
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("loss: far", "loss: loud")
+
+
+def test_a_plan_over_its_horizon():
+    """Lines hold its numbers; grey and red follow the limits of each step, those of any kind of
+    rows with one entry; what is no plan is told by its status."""
+    # The limits of dq come as rows; a soft one of q holds from k = 2 on.
+    states = jm.Polytope([[0, 2], [0, -1], [1, 1]], [4, 2, 9], labels=("up", "down", "both"))
+    soft = jm.Soft([[1, 0]], upper=[0.5], stages=(2, 3))
+    system = LinearSystem([[1, 0.1], [0, 1]], [0, 0.1], dt=0.1, state_names=("q", "dq"))
+    mpc = jm.MPC(
+        system, np.eye(2), np.eye(1), 3, states=states, inputs=Box([-1.0], [2.0]), soft=soft
+    )
+    x = np.array([[0.4, 1.0], [0.5, 1.1], [0.61, 1.3], [0.4, 1.5]])
+    u = np.array([[1.0], [2.0], [2.5]])
+    plan = dataclasses.replace(jm.solve(mpc, x[0]), states=x, inputs=u)
+    figure = plot_plan(plan, mpc, reference=[0.2, 0])
+    q, dq, torque = figure.axes
+    np.testing.assert_allclose(q.lines[0].get_ydata(), x[:, 0])
+    np.testing.assert_allclose(torque.lines[0].get_ydata(), [1, 2, 2.5, 2.5])
+    upper = {ax: ax.lines[2].get_ydata() for ax in figure.axes}
+    np.testing.assert_allclose(upper[q], [np.nan, np.nan, 0.5, 0.5])
+    np.testing.assert_allclose(upper[dq], [2, 2, 2, np.nan])
+    np.testing.assert_allclose(upper[torque], [2, 2, 2, 2])
+    np.testing.assert_allclose(dq.lines[1].get_ydata(), [-2, -2, -2, np.nan])
+    np.testing.assert_allclose(q.lines[3].get_xdata(), [0.2])
+    np.testing.assert_allclose(torque.lines[3].get_xdata(), [0.2, 0.3])
+    require_no_empty_panel(figure)
+    lost = dataclasses.replace(plan, status=np.int32(jm.Status.PRIMAL_INFEASIBLE))
+    assert "PRIMAL_INFEASIBLE" in plot_plan(lost, mpc).get_suptitle()
+    with pytest.raises(ValueError, match="plan: has states .4, 2. and inputs"):
+        plot_plan(plan, dataclasses.replace(mpc, horizon=4))

@@ -93,7 +93,7 @@ def plot_runs(
     if not all(part[shown].all() for part in kept):
         handles.append(line("limit exceeded", color=BROKEN, marker="o", ms=3, ls=""))
     columns = max(1, min(len(handles), int(figure.get_figwidth() / 2.5)))
-    _title_and_legend(figure, counts if title is None else title, handles, columns)
+    title_and_legend(figure, counts if title is None else title, handles, columns)
     return figure
 
 
@@ -139,7 +139,7 @@ def plot_before_after(
     ]
     if reference is not None or input_reference is not None:
         handles.append(Line2D([], [], label="set-point", **SET_POINT))
-    _title_and_legend(figure, title, handles, len(handles))
+    title_and_legend(figure, title, handles, len(handles))
     return figure
 
 
@@ -151,7 +151,7 @@ def _chosen(name: str, given: Any, count: int) -> np.ndarray:
     return shown
 
 
-def _title_and_legend(figure: Figure, title: str, handles: list[Any], columns: int) -> None:
+def title_and_legend(figure: Figure, title: str, handles: list[Any], columns: int) -> None:
     """Put the title above all panels, and the legend below them."""
     figure.suptitle(title, fontsize=9, x=0.01, ha="left")
     style: Style = {"loc": "outside lower left", "fontsize": 8, "frameon": False}

@@ -1,0 +1,143 @@
+"""One plan over its steps: states and inputs with their limits."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import jax
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from jaxmpc.app.plots.closed_loops import BROKEN, RUN, panel_grid, title_and_legend
+from jaxmpc.app.plots.style import EDGE, INFEASIBLE, NOT_SOLVED, SET_POINT, Style, patch
+from jaxmpc.checks import fail, require_kind
+from jaxmpc.mpc.plan import Plan, checked_aim
+from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.rows import given_blocks
+from jaxmpc.qp.status import Status
+
+# What a value may be beyond its limit, of the limit, before it counts as exceeded.
+BEYOND = 1e-6
+
+
+def plot_plan(
+    plan: Plan,
+    mpc: MPC,
+    *,
+    reference: Any = None,
+    input_reference: Any = None,
+    title: str | None = None,
+) -> Figure:
+    """Draw one plan over the horizon: a panel for each state and input.
+
+    plan: of `jm.solve`, of mpc. Points are the states x_k, lines the inputs u_k, which are held
+    for a step. Lines are the limits of single states and inputs, hard and soft, at the steps at
+    which they hold, grey beyond them; red: exceeded by more than 1e-6 of the limit, as soft ones
+    may be. Rows that couple several are not drawn. Purple: the plan is not SOLVED.
+    reference, input_reference: as `jm.solve` takes them, to draw. title: None: steps, status and
+    cost. Time is counted in steps where the system has no dt. Raises ValueError for many plans, or
+    one of another problem.
+    """
+    require_kind("plan", plan, Plan, cure="Give what jm.solve returns")
+    require_kind("mpc", mpc, MPC)
+    mpc.validate()
+    N, system = mpc.horizon, mpc.system
+    values = [np.asarray(v, float) for v in (plan.states, plan.inputs)]
+    if [v.shape for v in values] != [(N + 1, system.n), (N, system.m)]:
+        cure = "Give one plan of mpc; of many: jax.tree.map(lambda v: v[i], plans)"
+        fail("plan", f"has states {values[0].shape} and inputs {values[1].shape}", cure)
+    aim = checked_aim(mpc, values[0][0], reference, input_reference)
+    time = np.arange(N + 1) * (system.dt or 1.0)
+    place = SimpleNamespace(system=system, time_unit=system.time_unit if system.dt else "steps")
+    figure, panels = panel_grid(place, time, 2.9, (1.15, 2.0, 1.0))
+    solved, limits, exceeded = bool(plan.solved), _limits_of_axes(mpc), False
+    colour = RUN if solved else NOT_SOLVED
+    for ax, kind, i in panels:
+        target = (aim.states, aim.inputs)[kind]
+        if target is not None:
+            target = np.broadcast_to(np.asarray(target, float), values[kind].shape)[:, i]
+        low, high = limits[kind][..., i]
+        exceeded |= _draw(ax, time, values[kind][:, i], low, high, target, colour)
+    handles: list[Any] = [
+        Line2D([], [], color=colour, lw=1.0, marker=".", label="state, input held for a step"),
+        patch("beyond a limit", INFEASIBLE),
+    ]
+    if exceeded:
+        handles.append(Line2D([], [], color=BROKEN, marker="o", ms=3, ls="", label="exceeded"))
+    if reference is not None or input_reference is not None:
+        handles.append(Line2D([], [], label="set-point", **SET_POINT))
+    if title is None:
+        title = f"plan of {N} steps, cost {float(plan.cost):.6g}"
+        if not solved:
+            title = f"iterate of {N} steps, no plan: {Status(int(plan.status)).name}"
+    title_and_legend(figure, title, handles, 2)
+    return figure
+
+
+def _limits_of_axes(mpc: MPC) -> list[np.ndarray]:
+    """Return (2, N + 1, n) and (2, N, m): the lower and upper limits of each state and input by
+    itself at each step, ±inf for none."""
+    N, system = mpc.horizon, mpc.system
+    ends = [
+        np.stack([np.full(shape, -np.inf), np.full(shape, np.inf)])
+        for shape in ((N + 1, system.n), (N, system.m))
+    ]
+    with jax.enable_x64(True):
+        rows = given_blocks(jax.tree.map(np.float64, mpc), float)
+    for b in rows:
+        steps, sides = np.array(b.steps), (b.lower, b.upper)
+        for found, M, other in zip(ends, (b.H, b.D), (b.D, b.H), strict=True):
+            if b.rate or b.radius is not None or M is None or (other is not None and np.any(other)):
+                continue
+            M, (low, high) = (
+                np.broadcast_to(M, (len(steps), *np.shape(M)[-2:])),
+                (np.broadcast_to(side, (len(steps), b.size)) for side in sides),
+            )
+            for k, step in enumerate(steps):
+                for row, l, u in zip(M[k], low[k], high[k], strict=True):
+                    (i,) = axes if len(axes := np.flatnonzero(row)) == 1 else (None,)
+                    if i is None:
+                        continue
+                    one, two = sorted((l / row[i], u / row[i]))
+                    found[0, step, i] = max(found[0, step, i], one)
+                    found[1, step, i] = min(found[1, step, i], two)
+    return ends
+
+
+def _draw(
+    ax: Axes,
+    time: np.ndarray,
+    values: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    target: np.ndarray | None,
+    colour: str,
+) -> bool:
+    """Draw the values of a state (N + 1,) or of an input (N,) with limits and set-points of each
+    step, and return whether a limit is exceeded."""
+    held = len(values) < len(time)
+    if held:  # to the end of the last step
+        last = lambda v: None if v is None else np.append(v, v[-1])
+        values, low, high, target = (last(v) for v in (values, low, high, target))
+    style: Style = {"drawstyle": "steps-post"} if held else {"marker": ".", "ms": 4}
+    ax.plot(time, values, color=colour, lw=1.0, zorder=3, **style)
+    known = [v[np.isfinite(v)] for v in (values, low, high)]
+    every = np.concatenate(known if target is None else [*known, target])
+    least, most = (every.min(), every.max()) if len(every) else (0.0, 1.0)
+    room = 0.08 * (most - least) or 0.5
+    least, most = least - room, most + room
+    exceeded = np.zeros(len(values), bool)
+    for end, far in ((low, least), (high, most)):
+        there = np.isfinite(end)
+        step: Any = "post" if held else "mid"
+        ax.fill_between(time, end, far, where=there, step=step, color=INFEASIBLE, lw=0, zorder=0)
+        line = np.where(there, end, np.nan)
+        ax.plot(time, line, drawstyle=f"steps-{step}", color=EDGE, lw=0.7, zorder=1)
+        over = values - end if far == most else end - values
+        exceeded |= there & (over > BEYOND * np.maximum(1.0, np.abs(end)))
+    ax.plot(time[exceeded], values[exceeded], ".", color=BROKEN, ms=5, zorder=4)
+    if target is not None:
+        ax.plot(time, target, drawstyle="steps-post" if held else "default", zorder=2, **SET_POINT)
+    ax.set_ylim(least, most)
+    return bool(exceeded.any())
