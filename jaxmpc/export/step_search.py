@@ -8,6 +8,7 @@ suffices.
 
 import sys
 import time
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -59,7 +60,8 @@ def choose_steps(
     """Return the solver for `export_c` whose fixed steps solve most plans of closed loops.
 
     lower, upper: corners (n,) of the box of initial states. iterations: the number of steps, where
-    that is given; None: the least of 60, 120, 240, ... that will do, 1,920 at most. Under affine
+    that is given; None: the least of 60, 120, 240, ... that will do, 1,920 at most, with a
+    UserWarning where these do not. Under affine
     policies and tubes, whose QPs take long to try, all penalties are moved at once, one time.
     share: of the plans that have a solution, which should be solved. plans: of the closed loops
     that are looked at. tolerance: as in `export_c`. seed: of the initial states; those by which
@@ -103,13 +105,18 @@ def choose_steps(
             rho, reached = _improved(make, starts, target, -(-plans // LOOPS), rho, kinds)
             solver = ADMM(steps, rho, alpha, newton_steps=0)
             say(f"{steps:,} iterations solve {reached:.1%} of the plans")
-            if iterations is not None or reached >= share or steps >= MOST:
+            if iterations is not None or reached >= share:
                 return solver
             # Not every plan need have a solution: then precise plans say how many have.
             aim = {"reference": reference, "input_reference": input_reference}
             found = check_fixed_steps(mpc, solver, lower, upper, plans, tolerance, seed, **aim)
             say(f"and {found.reached:,} of the {found.solvable:,} that have a solution")
             if found.reached >= share * found.solvable:
+                return solver
+            if steps >= MOST:
+                text = f"{steps:,} iterations solve {found.reached:,} of {found.solvable:,} plans"
+                cure = "Give more iterations=, accept less (share=), or see tune_solver"
+                warnings.warn(f"choose_steps: {text}, not {share:.0%}. {cure}", stacklevel=2)
                 return solver
             steps *= 2
 

@@ -14,6 +14,7 @@ import pytest
 import jaxmpc as jm
 from jaxmpc.closed_loop import Disturbance, KalmanFilter, OffsetFreeController, augmented
 from jaxmpc.export import check_fixed_steps, choose_steps, export_c
+from jaxmpc.export.c_solver import ClosedLoopCheck
 
 CC = shutil.which("cc")
 compiled = pytest.mark.skipif(CC is None, reason="there is no C compiler")
@@ -307,6 +308,18 @@ def test_chosen_steps_solve_most_plans(capsys):
     assert begun.endswith(" s  25 iterations") and "25 iterations solve " in solved
     given = check_fixed_steps(mpc, jm.ADMM(iterations=25), *box, 400, seed=7)
     assert check_fixed_steps(mpc, few, *box, 400, seed=7).reached >= given.reached
+
+
+def test_a_search_that_does_not_reach_its_share_says_so(monkeypatch):
+    """With steps that solve 74 of 100 plans, whatever their number and penalties."""
+    place = "jaxmpc.export.step_search"
+    found = ClosedLoopCheck(100, 100, 74, 0.1, 0.1)
+    monkeypatch.setattr(f"{place}.starting_states", lambda *_: np.zeros((1, 2)))
+    monkeypatch.setattr(f"{place}._improved", lambda *given: (given[-2], 0.74))
+    monkeypatch.setattr(f"{place}.check_fixed_steps", lambda *_, **__: found)
+    with pytest.warns(UserWarning, match="choose_steps: 1,920 iterations solve 74 of 100 plans"):
+        solver = choose_steps(CHECKED, [-0.9, -0.9], [0.9, 0.9])
+    assert solver.iterations == 1920
 
 
 @pytest.mark.parametrize(
