@@ -186,6 +186,13 @@ def require_shape(argument: str, value: Any, shape: tuple[int, ...], cure: str) 
         fail(argument, f"shape {given} where {shape} is needed", cure)
 
 
+def require_last(argument: str, value: Any, shape: tuple[int, ...], cure: str) -> None:
+    """Raise unless the last axes of an array have this shape; axes of batches may stand before."""
+    given = tuple(getattr(value, "shape", None) or np.shape(value))
+    if given[-len(shape) :] != shape:
+        fail(argument, f"shape {given} where {shape} is needed", cure)
+
+
 def require_finite(argument: str, value: Any) -> None:
     """Raise if a readable `value` holds NaN or infinity, or no real numbers."""
     require_real(argument, value)

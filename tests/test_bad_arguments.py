@@ -317,7 +317,7 @@ CALLS = [
         lambda: mpc(input_rate_weight="w").validate(),
     ),
     (
-        "input_rate_weight: shape (2,). Give (1, 1) or (1,)",
+        "input_rate_weight: shape (2,) where (1, 1) is needed. Give (1, 1)",
         lambda: mpc(input_rate_weight=[1, 2.0]).validate(),
     ),
     (
@@ -412,7 +412,7 @@ CALLS = [
     ("B: entries of type <U1 where real", lambda: jm.LinearSystem(A, ["a", "b"]).validate()),
     ("B: shape () is not (n, m). Give a", lambda: jm.LinearSystem(A, 1.0).validate()),
     (
-        "B: shape (2, 1, 1) is not (n, m).",
+        "B: shape (2, 1, 1) where (2, 1) is needed.",
         lambda: jm.LinearSystem(A, np.zeros((2, 1, 1))).validate(),
     ),
     ("c: shape (3,) where (2,) is needed.", lambda: jm.LinearSystem(A, B, [1, 2, 3]).validate()),
@@ -807,3 +807,42 @@ def test_what_jax_cannot_trace_says_so(name, tmp_path, monkeypatch):
 
     with pytest.raises(ValueError, match=r"^(mpc|controller|A): is traced by JAX, .* outside jit"):
         jax.eval_shape(traced, A)
+
+
+@pytest.mark.parametrize(
+    "given, message",
+    [
+        ({"Q": np.eye(3)}, r"Q: shape \(3, 3\) where \(2, 2\)"),
+        ({"Q": [1.0, 2.0, 3.0]}, r"Q: shape \(3,\)"),
+        ({"R": np.eye(2)}, r"R: shape \(2, 2\) where \(1, 1\)"),
+        ({"terminal_cost": np.eye(1)}, "terminal_cost: shape"),
+        ({"states": jm.Box([-1.0] * 3, [1.0] * 3)}, "states: has dimension 3 where 2"),
+        ({"inputs": jm.Box([-1.0, -1.0], [1.0, 1.0])}, "inputs: has dimension 2 where 1"),
+        ({"terminal_set": jm.Polytope([[1.0, 0, 0]], [1.0])}, "terminal_set: has dimension 3"),
+        ({"input_rate_weight": np.eye(2)}, "input_rate_weight: shape"),
+        ({"A": [[1.0, 2.0]]}, r"A: shape \(1, 2\) where \(2, 2\)"),
+        ({"B": [1.0, 2.0, 3.0]}, r"B: shape \(3, 1\) where \(2, 1\)"),
+        ({"c": [1.0]}, r"c: shape \(1,\) where \(2,\)"),
+    ],
+)
+def test_shapes_that_do_not_fit_are_told_at_construction(given, message):
+    """In whatever stands for the numbers; JAX rebuilds problems of other shapes without a word."""
+    dynamics = {"A": [[1.0, 0.1], [0.0, 1.0]], "B": [0.0, 0.1]}
+
+    def make(given):
+        of_system = {k: given.get(k, dynamics.get(k)) for k in ("A", "B", "c")}
+        rest = {k: v for k, v in given.items() if k not in of_system}
+        start = {"Q": np.eye(2), "R": np.eye(1), "horizon": 3, "states": jm.Box([-1, -1], [1, 1])}
+        return jm.MPC(jm.LinearSystem(**of_system), **{**start, **rest})
+
+    with pytest.raises(ValueError, match=message):
+        make(given)
+    ((name, value),) = given.items()
+    if isinstance(value, np.ndarray | list):
+        with pytest.raises(ValueError, match=message):
+            jax.eval_shape(lambda v: make({name: v}), np.asarray(value))
+    mpc = make({})
+    many = jax.tree.map(lambda v: np.stack([v, v, v]), mpc)
+    assert dataclasses.replace(many, system=many.system).system.B.shape == (3, 2, 1)
+    for change in (np.transpose, np.shape, np.ravel, lambda v: object(), lambda v: 0):
+        jax.tree.leaves(jax.tree.map(change, many))

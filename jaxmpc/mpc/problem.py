@@ -23,14 +23,16 @@ from jaxmpc.checks import (
     fail,
     require_finite,
     require_kind,
+    require_last,
     require_real,
     require_shape,
     require_symmetric_psd,
 )
-from jaxmpc.pytrees import named_pytree, pytree, static, static_pytree
+from jaxmpc.pytrees import named_pytree, prepared_pytree, pytree, static, static_pytree
 from jaxmpc.qp.linalg import apply, matmul, namespace, symmetric
 from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope
 from jaxmpc.sets.disturbances import require_disturbance
+from jaxmpc.sets.fields import require_dimension
 from jaxmpc.sets.limits import output_limits
 from jaxmpc.systems.system import LinearSystem, host_matrices
 
@@ -169,7 +171,7 @@ class Switch:
         return repr(self.on)
 
 
-@pytree
+@prepared_pytree
 class MPC:
     """Constrained linear-quadratic MPC over the horizon N:
 
@@ -276,6 +278,29 @@ class MPC:
         for name, size in sets.items():
             if isinstance(getattr(self, name), Box):
                 object.__setattr__(self, name, getattr(self, name).spread(size))
+        self._require_fitting(n, m)
+
+    def _require_fitting(self, n: int, m: int) -> None:
+        """Raise ValueError where the last axes of weights and limits do not fit n states and m
+        inputs: what a constructor can say whatever stands for the numbers."""
+        weights = {
+            "Q": (n, "Q weighs the states: one row for each"),
+            "R": (m, "R weighs the inputs: one row for each"),
+            "terminal_cost": (n, "P weighs the last state"),
+            "input_rate_weight": (m, f"Give ({m}, {m}) or ({m},)"),
+        }
+        for name, (size, cure) in weights.items():
+            value = getattr(self, name)
+            if dimensions(value):
+                if np.shape(as_array(value)) == (self.horizon, size) != (size, size):
+                    cure = self._of_diagonals(name, size)
+                require_last(name, value, (size, size), cure)
+        for name, size in (("states", n), ("inputs", m), ("terminal_set", n)):
+            part = getattr(self, name)
+            kinds = ((Box, "lower"), (Polytope, "H"), (Ellipsoid, "P"))
+            found = [getattr(part, held) for kind, held in kinds if isinstance(part, kind)]
+            if found and dimensions(found[0]):
+                require_dimension(name, np.shape(as_array(found[0]))[-1], size)
 
     @property
     def disturbances(self) -> int:
@@ -435,7 +460,7 @@ class MPC:
         value, N = getattr(self, name), self.horizon
         shape = np.shape(as_array(value)) if dimensions(value) is not None else ()
         if shape == (N, size) != (size, size):
-            cure = f"For the diagonals of {N} steps give {name}[:, :, None] * np.eye({size})"
+            cure = self._of_diagonals(name, size)
         if len(shape) != 3:
             require_shape(name, value, (size, size), cure)
             require_symmetric_psd(name, value)
@@ -443,6 +468,11 @@ class MPC:
         require_shape(name, value, (N, size, size), f"A leading axis counts the {N} steps")
         for k in range(N if concrete(value) else 0):
             require_symmetric_psd(f"{name}[{k}]", np.asarray(value)[k])
+
+    def _of_diagonals(self, name: str, size: int) -> str:
+        """Return what to do about a weight of shape (N, size)."""
+        N = self.horizon
+        return f"For the diagonals of {N} steps give {name}[:, :, None] * np.eye({size})"
 
     def _validate_stages(self) -> None:
         N = self.horizon

@@ -10,8 +10,16 @@ import numpy as np
 import scipy
 
 from jaxmpc.arrays import Reals, as_array, as_column, dimensions, host_array, store_floats
-from jaxmpc.checks import concrete, fail, nearest, require_finite, require_printable, require_shape
-from jaxmpc.pytrees import pytree, static
+from jaxmpc.checks import (
+    concrete,
+    fail,
+    nearest,
+    require_finite,
+    require_last,
+    require_printable,
+    require_shape,
+)
+from jaxmpc.pytrees import prepared_pytree, static
 from jaxmpc.qp.linalg import matmul
 
 _TEXTS = ("state_names", "input_names", "state_units", "input_units")
@@ -30,7 +38,7 @@ def require_period(argument: str, dt: Any) -> None:
         fail(argument, f"{dt!r} is not a positive number", cure)
 
 
-@pytree
+@prepared_pytree
 class LinearSystem:
     """x+ = A x + B u + c, with x in R^n and u in R^m.
 
@@ -45,7 +53,8 @@ class LinearSystem:
 
     In an `MPC` each of A, B and c may have a leading axis of N steps.
     A, B and c are pytree leaves (they may be batched and differentiated); the rest is
-    static. The constructor checks nothing, `validate` does, and takes a vector B (n,) as one input.
+    static. The constructor checks how shapes fit together, `validate` all, and takes a vector B
+    (n,) as one input; JAX rebuilds it without checks.
     """
 
     A: Reals
@@ -62,6 +71,13 @@ class LinearSystem:
         store_floats(self, "A", "B", "c")
         if dimensions(self.A) == 2 and dimensions(self.B) == 1:
             object.__setattr__(self, "B", as_column(self.B))
+        if (dimensions(self.A) or 0) < 2 or (dimensions(self.B) or 0) < 2:
+            return  # `validate` says what is wrong, and `in_axes` are a system without arrays
+        n = self.n
+        require_last("A", self.A, (n, n), "A must be square")
+        require_last("B", self.B, (n, self.m), "Give B as many rows as A")
+        if dimensions(self.c):
+            require_last("c", self.c, (n,), "Give one number a state, or None")
 
     @property
     def n(self) -> int:

@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
@@ -113,10 +113,10 @@ class SetPoint:
         found: list[str] = []
         with jax.enable_x64(True):
             limits = given_blocks(jax.tree.map(np.float64, mpc), float)
-        for b in limits:
-            v = 0 * u if b.rate else u
-            along = np.tile(x, (mpc.horizon + 1, 1)), np.tile(v, (mpc.horizon, 1))
-            value, low, high = np.asarray(b.values(*along)), b.lower, b.upper
+            still: Any = np.tile(x, (mpc.horizon + 1, 1)), np.tile(u, (mpc.horizon, 1))
+            values = [np.asarray(b.values(still[0], still[1] * (not b.rate))) for b in limits]
+        for b, value in zip(limits, values, strict=True):
+            low, high = b.lower, b.upper
             if b.radius is not None:
                 value, low, high = np.sqrt(np.sum(value**2)), -b.radius, b.radius
             end = np.where(value > high, high, low)

@@ -551,19 +551,20 @@ class TestTypes:
         (dict(states=jm.Polytope(np.array([[1.0, 0.0], [-1.0, 0.0]]), np.array([1.0, -2.0]))),
          "states.*empty"),
         (dict(states=(-1.0, 1.0)), "states"),
-        (dict(system=jm.LinearSystem(np.ones((2, 3)), np.ones((2, 1)))), "A"),
-        (dict(system=jm.LinearSystem(np.eye(2), np.ones((3, 1)))), "B"),
+        (dict(system=lambda: jm.LinearSystem(np.ones((2, 3)), np.ones((2, 1)))), "A"),
+        (dict(system=lambda: jm.LinearSystem(np.eye(2), np.ones((3, 1)))), "B"),
         (dict(system=jm.LinearSystem(np.eye(2) * np.nan, np.ones((2, 1)))), "A"),
         (dict(system=(np.eye(2), np.ones((2, 1)))), "system"),
         (dict(prestabilise=np.ones((2, 2))), "prestabilise"),
     ],
 )  # fmt: skip
 def test_bad_problems_raise(change, words):
-    mpc = replace(problems.lecture(), **change)
-    for use in (lambda: jm.solve(mpc, np.zeros(2)), lambda: jm.Controller(mpc),
-                lambda: jm.map_feasible_set(mpc, np.zeros((1, 2)))):  # fmt: skip
+    """Where they are made, or by each function that takes them."""
+    for use in (lambda mpc: jm.solve(mpc, np.zeros(2)), jm.Controller,
+                lambda mpc: jm.map_feasible_set(mpc, np.zeros((1, 2)))):  # fmt: skip
         with pytest.raises(ValueError, match=words):
-            use()
+            made = {name: value() if callable(value) else value for name, value in change.items()}
+            use(replace(problems.lecture(), **made))
 
 
 @pytest.mark.parametrize("x0", [np.zeros(3), 0.0, np.zeros((2, 1)), np.zeros((5, 2))])

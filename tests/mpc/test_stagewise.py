@@ -360,8 +360,8 @@ def test_float32_and_bad_elements():
     ],
 )
 def test_bad_problems_raise(change, words):
-    mpc, system = change(problem(), varying())
     with pytest.raises(ValueError, match=words):
+        mpc, system = change(problem(), varying())
         solve_stagewise(replace(mpc, system=system), X0)
 
 

@@ -118,8 +118,8 @@ def _draw(
     step, and return whether a limit is exceeded."""
     held = len(values) < len(time)
     if held:  # to the end of the last step
-        last = lambda v: None if v is None else np.append(v, v[-1])
-        values, low, high, target = (last(v) for v in (values, low, high, target))
+        values, low, high = (np.append(v, v[-1]) for v in (values, low, high))
+        target = None if target is None else np.append(target, target[-1])
     style: Style = {"drawstyle": "steps-post"} if held else {"marker": ".", "ms": 4}
     ax.plot(time, values, color=colour, lw=1.0, zorder=3, **style)
     known = [v[np.isfinite(v)] for v in (values, low, high)]
