@@ -182,7 +182,7 @@ def tube_section(mpc: MPC) -> Zonotope:
         plant, gain, mpc.disturbance, disturbance_matrix=mpc.disturbance_matrix
     )
     section = found.to_zonotope()
-    count = np.shape(section.generators)[1]
+    count = np.asarray(section.generators).shape[1]
     if count > MANY:
         what = f"'tube' with a cross-section of {count:,} generators, each of them a variable"
         cure = 'A gain that damps faster has fewer, policy="tightened" none'

@@ -123,9 +123,8 @@ class SetPoint:
             beyond = np.maximum(value - high, low - value)
             over = np.broadcast_to(beyond > RESTS * np.abs(end), (len(b.steps), b.size))
             kind = "soft limit" if b.linear is not None else f"{b.kind} limit"
-            found += [
-                f"{kind} {name}" for name, out in zip(b.names, over.any(axis=0), strict=True) if out
-            ]
+            broken = np.flatnonzero(over.any(axis=0))
+            found += [f"{kind} {b.names[i]}" for i in broken]
         return cls(x, u, drift, tuple(dict.fromkeys(found)))
 
     def __str__(self) -> str:
@@ -149,8 +148,9 @@ class OfflineReport:
     feasible_set: map of initial states with proofs, of the problem with its soft rows hard; volume:
     lower and upper bound of its volume. recursion, penalty, terminal: the reports of
     `recursive_feasibility`, `exact_penalty` and `verify_terminal`, of the law whose set-point is
-    the origin. loops: closed loops to set_point that were simulated, not proved. None, where they
-    do not apply or the time was over.
+    the origin. loops: closed loops to the set-point that were simulated, not proved. None, where
+    they do not apply or the time was over. set_point: where the loops go, and what moves away from
+    there.
     notes: the reasons for what is None.
     variables, rows, condition: sizes of the condensed QP and condition number of its Hessian, of
     the variables that have a cost.

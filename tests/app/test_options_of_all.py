@@ -117,12 +117,14 @@ def test_fields_of_the_report_are_those_of_its_parts():
             volume=1.0, lost_by_any=np.nan, lost_by_law=0.1,
         ),
         loops=NominalLoops(np.zeros((6, 2)), 7, 5, 0.0, 0.0, 0.25, np.zeros(2), 0.5),
+        set_point=SimpleNamespace(x=np.zeros(2), u=np.ones(1), drift=0.0, broken=[]),
     )  # fmt: skip
     found = info.record(report)
     assert found["volume"] == {"inner": 1.0, "outer": None}
     assert found["feasible_set"] == {"counts": {"feasible": 4}} and found["notes"] == {
         "penalty": "time"
     }
+    assert found["set_point"] == {"x": [0.0, 0.0], "u": [1.0], "drift": 0.0, "broken": []}
     assert found["recursion"]["claims"] == {
         "law": {"holds": False, "reason": "why", "state": [1.0, 1.0]}
     }
