@@ -520,10 +520,8 @@ def broken_at_start(mpc: MPC, x0: np.ndarray) -> list[str]:
             continue
         if b.D is not None and np.any(b.D):
             continue
-        H, low, high = (
-            np.asarray(v)[0] if np.ndim(v) > d else np.asarray(v)
-            for v, d in ((b.H, 2), (b.lower, 1), (b.upper, 1))
-        )
+        H = np.asarray(b.H)[0] if np.ndim(b.H) == 3 else b.H
+        low, high = (b.at_steps(side, mpc.horizon + 1, 0.0)[0] for side in (b.lower, b.upper))
         for i, value in enumerate(H @ x0):
             end, side = (high[i], "above") if value > high[i] else (low[i], "below")
             over = max(value - high[i], low[i] - value)

@@ -86,22 +86,17 @@ def _limits_of_axes(mpc: MPC) -> list[np.ndarray]:
     with jax.enable_x64(True):
         rows = given_blocks(jax.tree.map(np.float64, mpc), float)
     for b in rows:
-        steps, sides = np.array(b.steps), (b.lower, b.upper)
+        low, high = b.at_steps(b.lower, N + 1, -np.inf), b.at_steps(b.upper, N + 1, np.inf)
         for found, M, other in zip(ends, (b.H, b.D), (b.D, b.H), strict=True):
             if b.rate or b.radius is not None or M is None or (other is not None and np.any(other)):
                 continue
-            M, (low, high) = (
-                np.broadcast_to(M, (len(steps), *np.shape(M)[-2:])),
-                (np.broadcast_to(side, (len(steps), b.size)) for side in sides),
-            )
-            for k, step in enumerate(steps):
-                for row, l, u in zip(M[k], low[k], high[k], strict=True):
-                    (i,) = axes if len(axes := np.flatnonzero(row)) == 1 else (None,)
-                    if i is None:
-                        continue
-                    one, two = sorted((l / row[i], u / row[i]))
-                    found[0, step, i] = max(found[0, step, i], one)
-                    found[1, step, i] = min(found[1, step, i], two)
+            each = np.broadcast_to(M, (len(b.steps), *M.shape[-2:]))
+            for k, of_step in zip(b.steps, each, strict=True):
+                alone = np.count_nonzero(of_step, axis=1) == 1
+                axis = np.argmax(of_step[alone] != 0, axis=1)
+                sides = np.array([low[k, alone], high[k, alone]]) / of_step[alone, axis]
+                np.maximum.at(found[0, k], axis, sides.min(axis=0))
+                np.minimum.at(found[1, k], axis, sides.max(axis=0))
     return ends
 
 
