@@ -25,6 +25,7 @@ plan that is right beside them need not be right beside the errors.
 import warnings
 from collections.abc import Callable
 from dataclasses import field, replace
+from functools import partial
 from typing import Any, TypeVar
 
 import jax
@@ -57,11 +58,11 @@ from jaxmpc.mpc.tightening import with_gain
 from jaxmpc.pytrees import prepared_pytree
 from jaxmpc.qp.admm import ADMM, DEFAULT, Factor
 from jaxmpc.qp.dual import has_dual_steps
-from jaxmpc.qp.jax_transformations import compiled_lightly, own_modes, varying
+from jaxmpc.qp.jax_transformations import attempted_first, compiled_lightly, own_modes, varying
 from jaxmpc.qp.linalg import apply, arrays, host_arrays, matmul, on_device, rounding
 from jaxmpc.qp.problem import QP, QPSolution
-from jaxmpc.qp.residuals import SHARE, Measured, Terms, worst
-from jaxmpc.qp.solve import in_two_parts, solve_factored
+from jaxmpc.qp.residuals import NEAR, SHARE, Measured, Terms, worst
+from jaxmpc.qp.solve import attempt, attempts, in_two_parts, solve_factored
 from jaxmpc.qp.status import Status
 from jaxmpc.sets.convex_sets import Box, Polytope
 
@@ -309,6 +310,21 @@ def _control(
 @own_modes
 def planned_from(controller: Controller, aim: Aim, start: WarmStart | None, *, whole: bool) -> Plan:
     """Return the plan of an aim; whole: see `qp.solve.in_two_parts`."""
+    c, given = controller.condensed, (controller, aim, start)
+    if isinstance(c, PolicyCondensed) or not (whole and attempts(controller.solver, c.balls, c.C)):
+        return planned_by(partial(solve_factored, whole=whole), *given)[0]
+    return attempted_first(_attempt, _plan_whole, _derived, *given)[0]
+
+
+def planned_by(
+    solve: Callable[..., tuple[QPSolution, Array]],
+    controller: Controller,
+    aim: Aim,
+    start: WarmStart | None,
+    share: float = 1.0,
+) -> tuple[Plan, QPSolution]:
+    """Return the plan of an aim, and the solution of its QP by `solve`, which takes what
+    `solve_factored` does. share: of the tolerances, that the plan must keep."""
     c, mpc = controller.condensed, controller.mpc
     N, n, m = mpc.horizon, mpc.system.n, mpc.system.m
     aim = aim if mpc.input_in_state else aim._replace(previous_input=None)
@@ -336,11 +352,28 @@ def planned_from(controller: Controller, aim: Aim, start: WarmStart | None, *, w
     if start is not None and not isinstance(c, PolicyCondensed):
         z = c.variables(start.states, start.inputs)
         pair = z if z0 is None else z - z0, start.multipliers
-    found, fault = solve_factored(qp, controller.factor, controller.solver, pair, whole=whole)
-    if z0 is not None:
-        found = replace(found, z=z0 + found.z)
+    solution, fault = solve(qp, controller.factor, controller.solver, pair)
+    found = solution if z0 is None else replace(solution, z=z0 + solution.z)
     fault = jnp.where(finite, fault, Status.NON_FINITE)
-    return planned(controller, theta, aim, found, fault)
+    return planned(controller, theta, aim, found, fault, share), solution
+
+
+_plan_whole = jax.jit(partial(planned_by, solve_factored))
+
+
+@jax.jit
+def _attempt(
+    controller: Controller, aim: Aim, start: WarmStart | None
+) -> tuple[tuple[Plan, QPSolution], Array]:
+    """Return what few steps on the dual find, and whether the residuals of the plan as stated are
+    as far below their tolerances as those of the QP at which the solver ends."""
+    unmeasured = partial(attempt, measured=False)
+    plan, solution = found = planned_by(unmeasured, controller, aim, start, share=NEAR)
+    return found, (plan.status == Status.SOLVED) & (solution.status == Status.SOLVED)
+
+
+def _derived(found: tuple[Plan, QPSolution], *given: Any) -> tuple[Plan, QPSolution]:
+    return planned_by(partial(solve_factored, found=found[1]), *given)
 
 
 _plan = compiled_lightly(1, static_argnames="whole")(planned_from)
@@ -386,7 +419,12 @@ def _of_rates(g: Array) -> Array:
 
 
 def planned(
-    controller: Controller, theta: Array, aim: Aim, found: QPSolution, fault: Array
+    controller: Controller,
+    theta: Array,
+    aim: Aim,
+    found: QPSolution,
+    fault: Array,
+    share: float = 1.0,
 ) -> Plan:
     """Return the plan of a solution of the condensed QP at θ (p,), with the status and residuals of
     the problem as stated; fault: the status that faulty data give, NOT_RUN for none.
@@ -405,7 +443,7 @@ def planned(
         found = replace(found, y=c.of_plan(found.y))
         return answer(mpc, c.layout, found, fault, states, inputs, aim, feedback, beyond)
     terms = stated_terms(*jax.lax.stop_gradient((controller, found.y, states, inputs, aim)))
-    eps, dtype = jnp.asarray(controller.solver.eps, states.dtype), states.dtype
+    eps, dtype = share * jnp.asarray(controller.solver.eps, states.dtype), states.dtype
     if dtype == jnp.float64:
         measured = Measured.of(terms, eps, rounding(dtype))
         found = replace(

@@ -43,10 +43,9 @@ from jaxmpc.qp.residuals import Pair
 
 # Most rows in W.
 MOST_ROWS = 48
-# The same in the first step of a batch on a CPU: a system of half as many rows takes a quarter of
-# the time, and most instances need no larger one. (turbompc's search: 17 µs a state, 23 with
-# MOST_ROWS.)
-FIRST_ROWS = 24
+# Of few steps: rows in the first, for a system of half as many rows takes a quarter of the time and
+# most instances need no larger one, and how many there are at most.
+FIRST_ROWS, FEW_STEPS = 24, 10
 # Steps in which all violated rows join W.
 JOINTLY = 2
 # Step lengths that are tried, beside the largest that stops no row.
@@ -297,8 +296,7 @@ def dual_search(
         most = most_rows(dual.A)
         state = DualSearch(point, none, go_on, jnp.asarray(False))
         step = partial(_search_step, steps, most)
-        first = partial(_first_step, steps, min(most, FIRST_ROWS))
-        end = repeat_while(lambda s: s.open, step, constants, state, first=first)
+        end = repeat_while(lambda s: s.open, step, constants, state)
         point, optimal = end.point, end.optimal
     if most == every:
         return point, optimal
@@ -311,6 +309,27 @@ def dual_search(
     return end.point, end.optimal
 
 
+def few_steps(measured: bool, p: ScaledProgram, y: Array) -> Pair:
+    """Return the pair after a few steps on the dual from y (m,), without a kernel: within its
+    tolerances where it is optimal, and its residuals are far below them. measured: False leaves
+    these out."""
+    f, dual, steps, most = p.factor, Dual.of(p), MostSteps(FEW_STEPS, 0), most_rows(p.factor.A)
+    constants = dual, DualPoint.cold(f.A, p.q)
+    none, false, point = jnp.int32(0), jnp.asarray(False), DualPoint.of(f.A, p.q, p.bounds, y)
+    begin, few = DualSearch(point, none, ~f.flat, false), min(most, FIRST_ROWS)
+    fits = jnp.sum(working_set(dual.bounds, point.y, point.v, false)) <= few
+    first = _search_step(steps, few, constants, begin)
+    begin = tree_where(fits & begin.open, first, begin)
+    end = repeat_while(lambda s: s.open, partial(_search_step, steps, most), constants, begin)
+    if measured:
+        pair = p.measure(end.point.w, end.point.y)[0]
+        done = end.optimal & pair.near
+    else:
+        z, y = p.unscaled(end.point.w, end.point.y)
+        pair, done = replace(Pair.none(z, y), z=z, y=y), end.optimal
+    return replace(pair, measured=replace(pair.measured, within_tolerance=done))
+
+
 def single_step(dual: Dual, point: DualPoint) -> DualPoint:
     """Return the point after one step, in which rows join singly."""
     true = jnp.asarray(True)
@@ -318,15 +337,6 @@ def single_step(dual: Dual, point: DualPoint) -> DualPoint:
         one = MostSteps(JOINTLY + 1, 0)
         return dual_search_kernel(dual, point, point, jnp.int32(JOINTLY), true, one)[0]
     return dual_step(dual, point, true, most_rows(dual.A))[0]
-
-
-def _first_step(
-    steps: MostSteps, few: int, constants: tuple[Dual, DualPoint], s: DualSearch
-) -> DualSearch:
-    """Return the state after a step with `few` rows in W at most; as it is where W has more."""
-    dual, point = constants[0], s.point
-    in_W = working_set(dual.bounds, point.y, point.v, jnp.asarray(False))
-    return tree_where(jnp.sum(in_W) <= few, _search_step(steps, few, constants, s), s)
 
 
 def _search_step(

@@ -44,14 +44,15 @@ Conditions = Callable[[Any, Any, Array, Array], tuple[Callable[[Any], Any], Undo
 Steps = Literal["short", "long", "recursion"]
 # Instances in a block on a CPU, whose data stay within the cache. (On GPUs blocks gain nothing.)
 BLOCK = 128
-# Instances in a group on a CPU at most, and when fewer are open; smaller batches are one group. (Of
-# 2,000 states of springs8 nine take 12 to 71 steps on the dual: in groups of 64 these took a fifth
-# of the time of all plans.)
-GROUPS_CPU = (128, 16, 4)
-# The same of loops with long steps, or that few instances of a batch enter; then of recursions
-# over a horizon, always so many. (64 arms of 7 joints for 1 s: 1.23 s in groups of 32, 1.11 of 16,
-# 1.17 of 8.)
-LONG_PART_CPU, LONG_FEW_CPU, RECURSION_CPU = 64, 8, 16
+# Instances in a group on a CPU. (Of 2,000 states of springs8 nine take 12 to 71 steps on the dual,
+# for which the others of their group wait.)
+GROUP_CPU = 4
+# The same of recursions over a horizon, of any batch. (64 arms of 7 joints for 1 s: 1.23 s in
+# groups of 32, 1.11 of 16, 1.17 of 8.)
+RECURSION_CPU = 16
+# Instances that an attempt left and that are solved as a whole at once there. (Plans of the joint
+# from far off, 30 % of them infeasible: 63 µs a state with 16, 48 with 32.)
+LEFT_CPU = 32
 # Instances in a group elsewhere: a quarter of the batch; when fewer are open a sixteenth of that,
 # and so on, but not below LEAST, where a step costs little more than its launches. (H100,
 # TurboMPC's problem, 4,096 at once: 2.6 µs a solve in one group, 1.6 in groups of 512, 1.2 of 1,024
@@ -238,11 +239,7 @@ def group_sizes(batch: int, steps: Steps = "short", work: int = 0) -> list[int]:
     if not isinstance(batch, int):
         return [batch]
     if jax.default_backend() == "cpu":
-        if steps == "recursion":
-            return [min(batch, RECURSION_CPU)]
-        if steps == "long":
-            return [batch] if batch <= LONG_PART_CPU else [LONG_PART_CPU, LONG_FEW_CPU]
-        return [batch] if batch <= GROUPS_CPU[0] else list(GROUPS_CPU)
+        return [min(batch, RECURSION_CPU if steps == "recursion" else GROUP_CPU)]
     least = min(max(WORK // max(work, 1), FEWEST), LEAST)
     if batch <= PART * least:
         return [batch]
@@ -292,6 +289,97 @@ def in_blocks(
     return one(constants, data)
 
 
+def attempted_first(
+    attempt: Callable[..., tuple[R, Array]],
+    whole: Callable[..., R],
+    again: Callable[..., R],
+    *arguments: Any,
+) -> R:
+    """Return whole(*arguments), differentiable; of a batch on a CPU what an attempt finds, where
+    that will do.
+
+    attempt(*arguments) returns such a result and whether it will do. It runs in blocks whose data
+    stay in the cache; then `whole` runs in small groups of the instances that are left.
+    again(result, *arguments): the same result, computed from itself, with its derivatives. The
+    functions must close over no arrays, and the first two be programs of `jax.jit`, traced once.
+    """
+    one = custom_vmap(lambda *arguments: whole(*arguments))
+
+    @one.def_vmap
+    @own_modes
+    def _(size: int, in_batched: list, *arguments: Any) -> tuple[R, Any]:
+        leaves, tree = jax.tree.flatten(arguments)
+        batched = tuple(jax.tree.leaves(in_batched))
+
+        def many(function: Callable[..., T]) -> Callable[..., T]:
+            plain = lambda *leaves: function(*jax.tree.unflatten(tree, leaves))
+            return jax.vmap(plain, in_axes=[0 if b else None for b in batched])
+
+        if jax.default_backend() != "cpu" or not isinstance(size, int) or 2 * size <= BLOCK:
+            return all_batched(many(whole)(*leaves))
+        run = partial(_attempted, many(attempt), many(whole), batched)
+        return all_batched(_of_one_batch(run, batched)(*leaves))
+
+    @jax.custom_jvp
+    def found(*arguments: Any) -> R:
+        return one(*arguments)
+
+    @found.defjvp
+    @own_modes
+    def _(primals: tuple, tangents: tuple) -> tuple[R, R]:
+        result = found(*primals)
+        return result, jax.jvp(partial(again, result), primals, tangents)[1]
+
+    return found(*arguments)
+
+
+def _attempted(
+    attempt: Callable[..., tuple[R, Array]],
+    whole: Callable[..., R],
+    batched: tuple[bool, ...],
+    *leaves: Array,
+) -> R:
+    """Return `attempted_first` of a batch; the functions take all leaves, `batched` or not."""
+    own = [v for v, b in zip(leaves, batched, strict=True) if b]
+
+    def given(own: list[Array]) -> list[Array]:
+        rest = iter(own)
+        return [next(rest) if b else v for v, b in zip(leaves, batched, strict=True)]
+
+    found, done = map_blocks(lambda own: attempt(*given(own)), min(BLOCK, len(own[0])), own)
+
+    def solve_some(carry: tuple[R, Array]) -> tuple[R, Array]:
+        found, left = carry
+        where = true_places(left, LEFT_CPU)
+        result = whole(*given([v.at[where].get(mode="clip") for v in own]))
+        put = lambda old, new: old.at[where].set(new, mode="drop")
+        return jax.tree.map(put, found, result), left.at[where].set(False, mode="drop")
+
+    return lax.while_loop(lambda carry: jnp.any(carry[1]), solve_some, (found, ~done))[0]
+
+
+def _of_one_batch(run: Callable[..., R], batched: tuple[bool, ...]) -> Callable[..., R]:
+    """Return `run`, of whose arguments some are `batched`, which works a further batch off as one
+    with the first."""
+    batch = custom_vmap(lambda *leaves: run(*leaves))
+
+    @batch.def_vmap
+    @own_modes
+    def _(size: int, outer: list[bool], *leaves: Array) -> tuple[R, Any]:
+        if any(o and not b for o, b in zip(outer, batched, strict=True)):
+            # Each outer instance has constants that its inner batch shares: copies would not fit.
+            axes = [0 if o else None for o in outer]
+            return all_batched(jax.vmap(run, in_axes=axes)(*leaves))
+        every = list(zip(leaves, batched, outer, strict=True))
+        inner = next(v.shape[1 if o else 0] for v, b, o in every if b)
+        copies = lambda v, o: v if o else jnp.broadcast_to(v, (size, *v.shape))
+        merged = lambda v: v.reshape(size * inner, *v.shape[2:])
+        out = batch(*(merged(copies(v, o)) if b else v for v, b, o in every))
+        return all_batched(jax.tree.map(lambda v: v.reshape(size, inner, *v.shape[1:]), out))
+
+    return batch
+
+
 def map_blocks(many: Callable[[S], R], block: int, data: S) -> R:
     """Return many(data) of a batch, computed for blocks of so many instances one after the other.
     The last one is filled up with the last instance."""
@@ -300,7 +388,7 @@ def map_blocks(many: Callable[[S], R], block: int, data: S) -> R:
     padded = lambda v: jnp.pad(v, ((0, missing), *[(0, 0)] * (v.ndim - 1)), mode="edge")
     grouped = jax.tree.map(lambda v: padded(v).reshape(-1, block, *v.shape[1:]), data)
     out = lax.map(many, grouped)
-    return jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:])[:size], out)
+    return jax.tree.map(lambda v: v.reshape(len(v) * block, *v.shape[2:])[:size], out)
 
 
 def repeat_while(
@@ -309,7 +397,6 @@ def repeat_while(
     constants: C,
     state: S,
     steps: Steps = "short",
-    first: Callable[[C, S], S] | None = None,
     work: int = 0,
 ) -> S:
     """Return `state` after state = step(constants, state) while is_open(state), a scalar.
@@ -318,10 +405,8 @@ def repeat_while(
     one `while_loop`. A batch, also one of nested `vmap`s, is worked off in groups (top of this
     file). steps: "long" where a step takes long or few instances are open at first; "recursion"
     where it is one over the stages of a horizon, which on a GPU takes as long for 4,096 instances
-    as for 1,024. first: a step that costs less than `step` and may leave an instance as it is: a
-    batch of several groups on a CPU takes it once before all others, without groups. work: about
-    how many operations a step of one instance has, where that is more than its launches take.
-    Not differentiable.
+    as for 1,024. work: about how many operations a step of one instance has,
+    where that is more than its launches take. Not differentiable.
     """
     one = lambda constants, state: lax.while_loop(is_open, lambda s: step(constants, s), state)
     single, state = custom_vmap(one), varying(state, (constants, state))
@@ -333,51 +418,48 @@ def repeat_while(
         batched = tuple(jax.tree.leaves(in_batched[0]))
         state = broadcast(size, in_batched[1], state)
 
-        def on_leaves(step: Callable[[C, S], S]) -> Callable[[tuple, S], S]:
-            return lambda leaves, state: step(jax.tree.unflatten(tree, leaves), state)
+        many = jax.vmap(
+            lambda leaves, state: step(jax.tree.unflatten(tree, leaves), state),
+            in_axes=(tuple(0 if b else None for b in batched), 0),
+        )
+        parts, structure = jax.tree.flatten(state)
 
-        begin = None if first is None else on_leaves(first)
-        run = _in_groups(is_open, on_leaves(step), batched, steps, begin, work)
-        return all_batched(run(tuple(leaves), state))
+        def run(*given: Array) -> S:
+            constants, state = given[: len(leaves)], given[len(leaves) :]
+            state = jax.tree.unflatten(structure, state)
+            return _in_groups(jax.vmap(is_open), many, batched, constants, state, steps, work)
+
+        both = *batched, *[True] * len(parts)
+        return all_batched(_of_one_batch(run, both)(*leaves, *parts))
 
     return single(constants, state)
 
 
 def _in_groups(
-    is_open: Callable[[S], Array],
-    step: Callable[[tuple, S], S],
+    open_ones: Callable[[S], Array],
+    many: Callable[[tuple, S], S],
     batched: tuple[bool, ...],
+    leaves: tuple,
+    state: S,
     steps: Steps,
-    first: Callable[[tuple, S], S] | None,
     work: int,
-) -> Callable[[tuple, S], S]:
-    """Return the loop for a batch, (leaves of the constants, states) → states. batched: which
-    leaves have the batch axis. first, work: as in `repeat_while`."""
-    axes = tuple(0 if b else None for b in batched), 0
-    many, open_ones = jax.vmap(step, in_axes=axes), jax.vmap(is_open)
+) -> S:
+    """Return `repeat_while` of a batch. many: (leaves of the constants, states) → states after a
+    step. batched: which leaves have the batch axis."""
+    size = jax.tree.leaves(state)[0].shape[0]
+    if not size:
+        return state
 
-    def advance_all(many: Callable[[tuple, S], S], leaves: tuple, state: S) -> S:
+    def advance_all(leaves: tuple, state: S) -> S:
         found, on = many(leaves, state), open_ones(state)
         choose = lambda new, old: jnp.where(on.reshape(-1, *[1] * (new.ndim - 1)), new, old)
         return jax.tree.map(choose, found, state)
-
-    def begin(first: Callable[[tuple, S], S], leaves: tuple, state: S) -> S:
-        """Return the states after the first step, taken block by block."""
-        advance = partial(advance_all, jax.vmap(first, in_axes=axes))
-        own = [v for v, b in zip(leaves, batched, strict=True) if b]
-
-        def of_block(block: tuple[list, S]) -> S:
-            rest = iter(block[0])
-            part = tuple(next(rest) if b else v for v, b in zip(leaves, batched, strict=True))
-            return advance(part, block[1])
-
-        return map_blocks(of_block, BLOCK, (own, state))
 
     def while_more(least: Any, advance: Callable[[S], S], state: S, real: Any = True) -> S:
         more = lambda state: jnp.sum(open_ones(state) & real) > least
         return lax.while_loop(more, advance, state)
 
-    def advance_group(leaves: tuple, count: int, least: int, state: S) -> S:
+    def advance_group(count: int, least: int, state: S) -> S:
         """Return the states after steps of the first `count` open instances side by side: until no
         more than `least` are open, or, while others wait, a quarter of them has finished."""
         on = open_ones(state)
@@ -385,46 +467,18 @@ def _in_groups(
         taken = lambda v: v.at[where].get(mode="clip")
         part = tuple(taken(v) if b else v for v, b in zip(leaves, batched, strict=True))
         enough = jnp.where(jnp.sum(on) > count, count - max(count // 4, 1), least)
-        # (Where fewer are open the group is filled up with copies of the last instance.)
-        advance, real = partial(advance_all, many, part), where < len(on)
+
+        advance, real = partial(advance_all, part), where < len(on)
         found = while_more(enough, advance, jax.tree.map(taken, state), real)
         put = lambda old, new: old.at[where].set(new, mode="drop")
         return jax.tree.map(put, state, found)
 
-    def run(leaves: tuple, state: S) -> S:
-        size = jax.tree.leaves(state)[0].shape[0]
-        if not size:
-            return state
-        counts = group_sizes(size, steps, work)
-        if first is not None and jax.default_backend() == "cpu" and counts[0] < size:
-            state = begin(first, leaves, state)
-        for count, least in zip(counts, [*counts[1:], 0], strict=True):
-            together = partial(advance_all, many, leaves)
-            group = partial(advance_group, leaves, count, least)
-            state = while_more(least, together if count == size else group, state)
-        return state
-
-    batch = custom_vmap(run)
-
-    @batch.def_vmap
-    @own_modes
-    def _(size: int, in_batched: tuple, leaves: tuple, state: S) -> tuple[S, Any]:
-        outer = in_batched[0]
-        state = broadcast(size, in_batched[1], state)
-        if any(o and not b for o, b in zip(outer, batched, strict=True)):
-            # Each outer instance has constants that its inner batch shares: copies would not fit.
-            axes = tuple(0 if o else None for o in outer)
-            return all_batched(jax.vmap(run, in_axes=(axes, 0))(leaves, state))
-        inner = jax.tree.leaves(state)[0].shape[1]
-        merged = lambda v: v.reshape(size * inner, *v.shape[2:])
-        flat = tuple(
-            merged(v if o else jnp.broadcast_to(v, (size, *v.shape))) if b else v
-            for v, b, o in zip(leaves, batched, outer, strict=True)
-        )
-        out = batch(flat, jax.tree.map(merged, state))
-        return all_batched(jax.tree.map(lambda v: v.reshape(size, inner, *v.shape[1:]), out))
-
-    return batch
+    counts = group_sizes(size, steps, work)
+    for count, least in zip(counts, [*counts[1:], 0], strict=True):
+        together = partial(advance_all, leaves)
+        group = partial(advance_group, count, least)
+        state = while_more(least, together if count == size else group, state)
+    return state
 
 
 def all_batched(out: R) -> tuple[R, Any]:

@@ -35,8 +35,9 @@ from jaxmpc.qp.admm import (
 )
 from jaxmpc.qp.admm_kernel import iterate_batch, suits
 from jaxmpc.qp.derivative import dense_conditions
-from jaxmpc.qp.dual import has_dual_steps, solve_dual
+from jaxmpc.qp.dual import FEW_STEPS, few_steps, has_dual_steps, solve_dual
 from jaxmpc.qp.jax_transformations import (
+    attempted_first,
     compiled_lightly,
     has_kernels,
     implicit,
@@ -114,16 +115,57 @@ def solve_qp(qp: QP, solver: ADMM = DEFAULT, warm_start: WarmPair = None) -> QPS
 @own_modes
 def _solve(qp: QP, solver: ADMM, warm_start: WarmPair, *, whole: bool) -> QPSolution:
     made = factorise(qp.P, qp.A, solver, qp.balls)
-    return with_fault(*solve_factored(qp, made, solver, warm_start, whole=whole))
+    given = qp, made, solver, warm_start
+    if whole and attempts(solver, qp.balls, qp.A):
+        return with_fault(*attempted_first(_attempt, _solve_whole, _derived, *given))
+    return with_fault(*solve_factored(*given, whole=whole))
+
+
+def attempts(solver: ADMM, balls: tuple[int, ...], A: Array) -> bool:
+    """Return whether a few steps on the dual may solve programs: else there is no `attempt`."""
+    free = not solver.fixed and solver.differentiate == "implicit"
+    return free and solver.most_newton_steps() >= FEW_STEPS and has_dual_steps(balls, A)
+
+
+def attempt(
+    qp: QP,
+    factor: Factor,
+    solver: ADMM,
+    warm_start: WarmPair = None,
+    *,
+    measured: bool = True,
+) -> tuple[QPSolution, Array]:
+    """`solve_factored` by a few steps on the dual: SOLVED, or ITERATION_LIMIT where these do not
+    suffice. measured: False leaves out the residuals of float64 data. Not differentiable."""
+    clean, fault = cleaned(qp, factor.fault)
+    p = ScaledProgram.of(clean, factor, tolerance(solver, qp.q.dtype))
+    begin, single = admm_end(p, solver, warm_start, refined=True), p.q.dtype != jnp.float64
+    steps = partial(few_steps, measured or single)
+    pair = precisely(lambda p, y: steps(p.unrounded() if single else p, y), p, begin.y)
+    found = with_status(pair.measured, pair.z, pair.y, Proof.none(p.q, p.bounds.l))
+    count = jnp.int32(admm_steps(solver, warm_start))
+    return replace(found, cost=value(clean, pair.z, pair.y), iterations=count), fault
+
+
+@jax.jit
+def _attempt(*given: Any) -> tuple[tuple[QPSolution, Array], Array]:
+    found, fault = attempt(*given)
+    return (found, fault), found.status == Status.SOLVED
 
 
 def solve_factored(
-    qp: QP, factor: Factor, solver: ADMM, warm_start: WarmPair = None, *, whole: bool = True
+    qp: QP,
+    factor: Factor,
+    solver: ADMM,
+    warm_start: WarmPair = None,
+    *,
+    whole: bool = True,
+    found: QPSolution | None = None,
 ) -> tuple[QPSolution, Array]:
     """`solve_qp` after its factorization: what a controller repeats at each sample.
 
     whole: False leaves out the method of multipliers and proofs, and ADMM after a warm start
-    (`in_two_parts`).
+    (`in_two_parts`). found: the solution where it is known, and derivatives alone are asked for.
     Returns the solution and the fault of the data, NOT_RUN for none. Where there is one the
     solution is that of harmless data: `with_fault` says so, after all that is computed from it, for
     the derivative of a product with NaN is NaN even where nobody looks at it.
@@ -133,13 +175,20 @@ def solve_factored(
         solver = replace(solver, iterations=0)
     if solver.differentiate == "implicit":
         constants = jax.lax.stop_gradient((clean, factor, solver, warm_start))
-        found = search(*constants, whole)
+        found = search(*constants, whole) if found is None else found
         z, y = implicit(dense_conditions, clean, (constants[1], solver.smoothing), found.z, found.y)
     else:
         found = search(clean, factor, solver, warm_start, whole)
         z, y = found.z, found.y
     steps = jnp.int32(admm_steps(solver, warm_start))
     return replace(found, z=z, y=y, cost=value(clean, z, y), iterations=steps), fault
+
+
+_solve_whole = jax.jit(solve_factored)
+
+
+def _derived(found: tuple[QPSolution, Array], *given: Any) -> tuple[QPSolution, Array]:
+    return solve_factored(*given, found=found[0])
 
 
 def search(

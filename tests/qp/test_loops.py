@@ -7,7 +7,14 @@ import pytest
 
 import jaxmpc as jm
 from jaxmpc.qp import jax_transformations
-from jaxmpc.qp.jax_transformations import BLOCK, group_sizes, in_blocks, repeat_while, true_places
+from jaxmpc.qp.jax_transformations import (
+    BLOCK,
+    attempted_first,
+    group_sizes,
+    in_blocks,
+    repeat_while,
+    true_places,
+)
 
 
 def collatz(start: int) -> int:
@@ -53,27 +60,47 @@ def test_a_recursion_has_three_groups_on_a_gpu(monkeypatch):
     assert group_sizes(1024, "recursion") == [1024]
 
 
+def product(factor, n):
+    """factor·n and by which way it was found: an attempt (1), which does for even n, or not (0)."""
+    derived = lambda found, factor, n: (factor * n, found[1])
+    return attempted_first(attempted, as_a_whole, derived, factor, n)
+
+
+@jax.jit
+def attempted(factor, n):
+    return (jnp.where(n % 2 == 0, factor * n, jnp.nan), jnp.int32(1)), n % 2 == 0
+
+
+@jax.jit
+def as_a_whole(factor, n):
+    return factor * n, jnp.int32(0)
+
+
 @pytest.mark.parametrize("shared", [True, False])
 @pytest.mark.parametrize("count", [1, 5, 300])
-def test_a_first_step_that_leaves_some_as_they_are(count, shared):
-    """A batch of several groups halves even numbers first; odd ones lose nothing by it."""
-    starts = np.arange(1, count + 1, dtype=np.int32)
-    is_open = lambda state: state[0] != 1
+def test_an_attempt_goes_first(count, shared):
+    """In batches that are not small; its results stand where it says so, those of the whole
+    elsewhere, and the derivatives are those of the product."""
+    n, factor = jnp.arange(count, dtype=jnp.float32), jnp.float32(3)
+    factor = factor if shared else jnp.full(count, factor)
+    batch = jax.vmap(product, (None if shared else 0, 0))
+    found, way = jax.jit(batch)(factor, n)
+    np.testing.assert_array_equal(found, 3 * n)
+    np.testing.assert_array_equal(way, (n % 2 == 0) if count > BLOCK else 0 * n)
+    total = lambda factor: jnp.sum(batch(factor, n)[0])
+    np.testing.assert_array_equal(jax.jit(jax.grad(total))(factor), jnp.sum(n) if shared else n)
 
-    def step(multiplier, state):
-        n, steps = state
-        return jnp.where(n % 2 == 0, n // 2, multiplier * n + 1), steps + 1
 
-    def halved(multiplier, state):
-        n, steps = state
-        return jnp.where(n % 2 == 0, n // 2, n), steps + (n % 2 == 0)
-
-    def run(multiplier, start):
-        return repeat_while(is_open, step, multiplier, (start, jnp.int32(0)), first=halved)[1]
-
-    multiplier = jnp.int32(3) if shared else jnp.full(count, 3, jnp.int32)
-    found = jax.jit(jax.vmap(run, in_axes=(None if shared else 0, 0)))(multiplier, starts)
-    np.testing.assert_array_equal(found, [collatz(int(n)) for n in starts])
+@pytest.mark.parametrize("axes", [(None, 0), (0, 0), (0, None)])
+def test_an_attempt_of_nested_batches(axes):
+    n, factors = jnp.arange(2.0 * BLOCK).reshape(2, BLOCK), jnp.array([3.0, 5.0])
+    inner = jax.vmap(product, (None, 0))
+    found, way = jax.vmap(inner, axes)(
+        factors if axes[0] == 0 else factors[0], n if axes[1] == 0 else n[0]
+    )
+    wanted = (factors[:, None] if axes[0] == 0 else 3.0) * (n if axes[1] == 0 else n[:1])
+    np.testing.assert_array_equal(found, wanted)
+    np.testing.assert_array_equal(way, np.broadcast_to(np.arange(BLOCK) % 2 == 0, (2, BLOCK)))
 
 
 @pytest.mark.parametrize("axes", [(None, 0), (0, 0), (0, None)])
