@@ -6,9 +6,8 @@ In ADMM's coordinates (H = I; `qp/admm.py`) a solution with active rows W has mu
 S_WW y_W = v_W − b_W, where v = −A q are the rows of the unconstrained minimiser and b the active
 bounds. Both are affine in the parameter θ of the problem, and so is y_W = L (θ, 1): the law of the
 critical region (Bemporad et al. 2002, Automatica 38). States that lie in the same region as a
-solved one get their exact solution from its law; near it the law is a start from which few steps on
-the dual are left. Nothing is assumed: every plan is accepted by its own residuals
-(`qp/solve.py`, `solve_from`), and what is not solved so goes to the solver.
+solved one get their exact solution from its law. Nothing is assumed: every plan is accepted by its
+own residuals, and what is not solved so goes to the solver.
 
 The nearest solved state is found by cells: quantiles of the states divide each coordinate, one
 state of each cell is solved, and each state follows the nearest of its own cell and of those beside
@@ -53,10 +52,11 @@ from jaxmpc.mpc.plan import Aim, Multipliers, Plan, flat_multipliers
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.admm import ADMM, DEFAULT, scaled_multipliers
-from jaxmpc.qp.dual import MORE_STEPS, MOST_STEPS, RIDGE, has_dual_steps, most_rows
-from jaxmpc.qp.jax_transformations import true_places
+from jaxmpc.qp.dual import RIDGE, has_dual_steps, most_rows
+from jaxmpc.qp.jax_transformations import BLOCK as CACHED
+from jaxmpc.qp.jax_transformations import map_blocks, true_places
 from jaxmpc.qp.linalg import matmul, solve
-from jaxmpc.qp.solve import solve_from
+from jaxmpc.qp.solve import pair_of
 from jaxmpc.qp.status import Status
 
 # States from which on transfer is tried: below, compiling its programs costs more than it saves.
@@ -66,8 +66,6 @@ BLOCK = 2048
 # Of chunks so many or more, one is tried before all others; where fewer than this fraction of those
 # that can be solved are by following, solving takes less time.
 TRIAL, LEAST = 16, 0.3
-# Steps on the dual from the law of a neighbour.
-FOLLOW_STEPS = MOST_STEPS + MORE_STEPS
 # Coordinates of a state up to which its neighbours are near enough.
 MOST_COORDINATES = 4
 # One state in so many is solved first.
@@ -189,16 +187,14 @@ class Batch:
         left = np.delete(np.arange(len(self.x)), index)
         if len(left) >= TRIAL * self.chunk:
             few = np.random.default_rng(0).choice(left, self.chunk, replace=False)
-            self._run(_follow(self.devices, 0), arguments, few)
+            self._run(_follow(self.devices), arguments, few)
             solvable = 1 - np.mean(self._unsolved(index))
             if 1 - np.mean(self._unsolved(few)) < LEAST * solvable:
                 return left
-        # The first time all states, for those that are next to each other are copied faster.
-        left = np.arange(len(self.x))
-        for steps in (0, FOLLOW_STEPS):
-            self._run(_follow(self.devices, steps), arguments, left)
-            left = left[self._unsolved(left)]
-        return left
+        # All states, for those that are next to each other are copied faster.
+        every = np.arange(len(self.x))
+        self._run(_follow(self.devices), arguments, every)
+        return every[self._unsolved(every)]
 
     def _unsolved(self, index: np.ndarray) -> np.ndarray:
         """Return which of these states (k,) have no plan yet."""
@@ -317,11 +313,11 @@ def _plans(devices: Devices) -> Compiled:
 
 
 @functools.cache
-def _follow(devices: Devices, steps: int) -> Compiled:
+def _follow(devices: Devices) -> Compiled:
     """Return the program (controller, laws, cells, x (B, p)) → plans of `follow`."""
 
     def run(controller: Controller, laws: Laws, cells: Cells, x: Array) -> Plan:
-        return jax.vmap(partial(follow, controller, laws, cells, steps))(x)
+        return map_blocks(jax.vmap(partial(follow, controller, laws, cells)), CACHED, x)
 
     return over_devices(run, devices, (False, False, False, True))
 
@@ -439,13 +435,13 @@ def laws_of(controller: Controller, multipliers: Multipliers, status: Array) -> 
     return jax.vmap(law)(flat, status == Status.SOLVED)
 
 
-def follow(controller: Controller, laws: Laws, cells: Cells, steps: int, theta: Array) -> Plan:
-    """Return the plan from θ (p,) by the law of a solved state nearby and so many steps on the
-    dual: SOLVED, or ITERATION_LIMIT where that leads to none."""
+def follow(controller: Controller, laws: Laws, cells: Cells, theta: Array) -> Plan:
+    """Return the plan from θ (p,) by the law of a solved state nearby: SOLVED, or ITERATION_LIMIT
+    where that does not hold, or there is none."""
     c, f = controller.condensed, controller.factor
     i = cells.nearest(theta)
     y = jnp.where(i < 0, jnp.nan, laws.evaluate(i, theta, len(f.E)))
-    found, fault = solve_from(c.qp(theta), f, controller.solver, y, steps)
+    found, fault = pair_of(c.qp(theta), f, y)
     x0, previous = jnp.split(theta, [controller.mpc.system.n])
     aim = Aim(x0, previous_input=previous if controller.mpc.input_in_state else None)
     return planned(controller, theta, aim, found, fault)

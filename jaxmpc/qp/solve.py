@@ -35,7 +35,7 @@ from jaxmpc.qp.admm import (
 )
 from jaxmpc.qp.admm_kernel import iterate_batch, suits
 from jaxmpc.qp.derivative import dense_conditions
-from jaxmpc.qp.dual import FEW_STEPS, few_steps, has_dual_steps, solve_dual
+from jaxmpc.qp.dual import FEW_STEPS, few_steps, has_dual_steps
 from jaxmpc.qp.jax_transformations import (
     attempted_first,
     compiled_lightly,
@@ -406,22 +406,15 @@ def tolerance(solver: ADMM, dtype: DTypeLike) -> Array:
     return jnp.asarray(solver.eps, dtype)
 
 
-def solve_from(
-    qp: QP, factor: Factor, solver: ADMM, y: Array, steps: int
-) -> tuple[QPSolution, Array]:
-    """`solve_factored` by `steps` steps on the dual from multipliers y (m,) in ADMM's coordinates:
-    SOLVED, or ITERATION_LIMIT, at once where y is not finite. Without a step, for multipliers of
-    the solution, nothing is measured yet: ITERATION_LIMIT. For hard rows, without balls, in
-    float64; not differentiable."""
+def pair_of(qp: QP, factor: Factor, y: Array) -> tuple[QPSolution, Array]:
+    """`solve_factored` for multipliers y (m,) in ADMM's coordinates that may be those of the
+    solution: ITERATION_LIMIT, for nothing is measured. For hard rows, without balls; not
+    differentiable."""
     clean, fault = cleaned(qp, factor.fault)
-    p = ScaledProgram.of(clean, factor, tolerance(solver, qp.q.dtype))
-    proof, usable = Proof.none(p.q, p.bounds.l), jnp.all(jnp.isfinite(y))
-    y = p.bounds.admissible(jnp.where(usable, y / p.unit, 0.0))
-    if not steps:
-        z, y = p.unscaled(-p.q - matmul(y, factor.A), y)
-        return with_status(Pair.none(z, y).measured, z, y, proof), fault
-    pair, _ = solve_dual(p, y, usable & ~factor.flat, steps)
-    return with_status(pair.measured, pair.z, pair.y, proof), fault
+    p = ScaledProgram.of(clean, factor)
+    y = p.bounds.admissible(jnp.where(jnp.all(jnp.isfinite(y)), y / p.unit, 0.0))
+    z, y = p.unscaled(-p.q - matmul(y, factor.A), y)
+    return with_status(Pair.none(z, y).measured, z, y, Proof.none(p.q, p.bounds.l)), fault
 
 
 def feasibility_margin(
