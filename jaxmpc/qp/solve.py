@@ -107,16 +107,21 @@ def solve_qp(qp: QP, solver: ADMM = DEFAULT, warm_start: WarmPair = None) -> QPS
     solver.validate(np.shape(qp.A)[0])
     if warm_start is not None:
         require_warm_start(qp, warm_start)
+    linear = concrete(qp.P) and not np.any(qp.P)
     arguments = as_arrays(qp), *arrays((solver, warm_start))
-    return in_two_parts(_solve, not has_dual_steps(qp.balls, qp.A), solver, *arguments)
+    hard = linear or not has_dual_steps(qp.balls, qp.A)
+    return in_two_parts(partial(_solve, linear=linear), hard, solver, *arguments)
 
 
-@compiled_lightly(1, static_argnames="whole")
+@compiled_lightly(1, static_argnames=("whole", "linear"))
 @own_modes
-def _solve(qp: QP, solver: ADMM, warm_start: WarmPair, *, whole: bool) -> QPSolution:
+def _solve(
+    qp: QP, solver: ADMM, warm_start: WarmPair, *, whole: bool, linear: bool = False
+) -> QPSolution:
+    """`solve_qp`. linear: known to have P = 0, so that there are no steps on the dual."""
     made = factorise(qp.P, qp.A, solver, qp.balls)
     given = qp, made, solver, warm_start
-    if whole and attempts(solver, qp.balls, qp.A):
+    if whole and not linear and attempts(solver, qp.balls, qp.A):
         return with_fault(*attempted_first(_attempt, _solve_whole, _derived, *given))
     return with_fault(*solve_factored(*given, whole=whole))
 
@@ -451,5 +456,5 @@ def feasibility_margin(
     none = jnp.full(m, jnp.inf, dtype)
     l = jnp.concatenate([-none, bounds.l, -jnp.full(1, jnp.inf, dtype)])
     u = jnp.concatenate([bounds.u, none, jnp.full(1, max_margin, dtype)])
-    solution = solve_qp(QP(jnp.zeros((n + 1, n + 1), dtype), -last, A, l, u), solver)
+    solution = solve_qp(QP(np.zeros((n + 1, n + 1), dtype), -last, A, l, u), solver)
     return -solution.cost, solution.status
