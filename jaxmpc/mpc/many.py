@@ -53,10 +53,9 @@ from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.admm import ADMM, DEFAULT, scaled_multipliers
 from jaxmpc.qp.dual import RIDGE, has_dual_steps, most_rows
-from jaxmpc.qp.jax_transformations import BLOCK as CACHED
 from jaxmpc.qp.jax_transformations import map_blocks, true_places
 from jaxmpc.qp.linalg import matmul, solve
-from jaxmpc.qp.solve import pair_of
+from jaxmpc.qp.solve import from_multipliers
 from jaxmpc.qp.status import Status
 
 # States from which on transfer is tried: below, compiling its programs costs more than it saves.
@@ -317,7 +316,7 @@ def _follow(devices: Devices) -> Compiled:
     """Return the program (controller, laws, cells, x (B, p)) → plans of `follow`."""
 
     def run(controller: Controller, laws: Laws, cells: Cells, x: Array) -> Plan:
-        return map_blocks(jax.vmap(partial(follow, controller, laws, cells)), CACHED, x)
+        return map_blocks(jax.vmap(partial(follow, controller, laws, cells)), x)
 
     return over_devices(run, devices, (False, False, False, True))
 
@@ -441,7 +440,7 @@ def follow(controller: Controller, laws: Laws, cells: Cells, theta: Array) -> Pl
     c, f = controller.condensed, controller.factor
     i = cells.nearest(theta)
     y = jnp.where(i < 0, jnp.nan, laws.evaluate(i, theta, len(f.E)))
-    found, fault = pair_of(c.qp(theta), f, y)
+    found, fault = from_multipliers(c.qp(theta), f, y)
     x0, previous = jnp.split(theta, [controller.mpc.system.n])
     aim = Aim(x0, previous_input=previous if controller.mpc.input_in_state else None)
     return planned(controller, theta, aim, found, fault)

@@ -10,6 +10,8 @@ Batches. Under `jax.vmap` a plain `jax.lax.while_loop` runs until its slowest in
 and all others wait. `repeat_while` gathers, on the device, the instances that are still open into
 groups of static size, advances a group at a time, and scatters the results back: the cost is that
 of the mean number of steps, not of the largest. Nothing returns to the host in between.
+`attempted_first` keeps most instances of a batch on a CPU out of such loops: what few steps solve
+is solved from beginning to end in blocks whose data stay in the cache.
 
 Derivatives. `implicit` gives the solution of a problem those of its optimality conditions.
 """
@@ -47,7 +49,7 @@ BLOCK = 128
 # Instances in a group on a CPU. (Of 2,000 states of springs8 nine take 12 to 71 steps on the dual,
 # for which the others of their group wait.)
 GROUP_CPU = 4
-# The same of loops with many steps at first, where all instances of a large batch take them.
+# The same of "long" loops of larger batches at first, as where all of their instances enter.
 # (Margins of 20 rows in 6 variables, 1,000 at once: 82 µs each, 197 in groups of four alone.)
 LONG_CPU = 64
 # The same of recursions over a horizon, of any batch. (64 arms of 7 joints for 1 s: 1.23 s in
@@ -281,7 +283,7 @@ def in_blocks(
         def blocks(block: int, constants: C, data: S) -> R:
             if size <= block:
                 return together(constants, data)
-            return map_blocks(partial(together, constants), block, data)
+            return map_blocks(partial(together, constants), data, block)
 
         small = not isinstance(size, int) or (size <= BLOCK and kernel is None)
         if any(jax.tree.leaves(in_batched[0])) or small:
@@ -351,14 +353,11 @@ def _attempted(
         rest = iter(own)
         return [next(rest) if b else v for v, b in zip(leaves, batched, strict=True)]
 
-    found, done = map_blocks(lambda own: attempt(*given(own)), min(BLOCK, len(own[0])), own)
+    found, done = map_blocks(lambda own: attempt(*given(own)), own)
 
     def solve_some(carry: tuple[R, Array]) -> tuple[R, Array]:
-        found, left = carry
-        where = true_places(left, LEFT_CPU)
-        result = whole(*given([v.at[where].get(mode="clip") for v in own]))
-        put = lambda old, new: old.at[where].set(new, mode="drop")
-        return jax.tree.map(put, found, result), left.at[where].set(False, mode="drop")
+        where = true_places(carry[1], LEFT_CPU)
+        return put(where, carry, (whole(*given(taken(where, own))), False))
 
     return lax.while_loop(lambda carry: jnp.any(carry[1]), solve_some, (found, ~done))[0]
 
@@ -385,10 +384,11 @@ def _of_one_batch(run: Callable[..., R], batched: tuple[bool, ...]) -> Callable[
     return batch
 
 
-def map_blocks(many: Callable[[S], R], block: int, data: S) -> R:
+def map_blocks(many: Callable[[S], R], data: S, block: int = BLOCK) -> R:
     """Return many(data) of a batch, computed for blocks of so many instances one after the other.
     The last one is filled up with the last instance."""
     size = jax.tree.leaves(data)[0].shape[0]
+    block = max(min(block, size), 1)
     missing = -size % block
     padded = lambda v: jnp.pad(v, ((0, missing), *[(0, 0)] * (v.ndim - 1)), mode="edge")
     grouped = jax.tree.map(lambda v: padded(v).reshape(-1, block, *v.shape[1:]), data)
@@ -410,8 +410,8 @@ def repeat_while(
     one `while_loop`. A batch, also one of nested `vmap`s, is worked off in groups (top of this
     file). steps: "long" where a step takes long or few instances are open at first; "recursion"
     where it is one over the stages of a horizon, which on a GPU takes as long for 4,096 instances
-    as for 1,024. work: about how many operations a step of one instance has,
-    where that is more than its launches take. Not differentiable.
+    as for 1,024. work: about how many operations a step of one instance has, where that is more
+    than its launches take. Not differentiable.
     """
     one = lambda constants, state: lax.while_loop(is_open, lambda s: step(constants, s), state)
     single, state = custom_vmap(one), varying(state, (constants, state))
@@ -469,14 +469,11 @@ def _in_groups(
         more than `least` are open, or, while others wait, a quarter of them has finished."""
         on = open_ones(state)
         where = true_places(on, count)
-        taken = lambda v: v.at[where].get(mode="clip")
-        part = tuple(taken(v) if b else v for v, b in zip(leaves, batched, strict=True))
+        part = tuple(taken(where, v) if b else v for v, b in zip(leaves, batched, strict=True))
         enough = jnp.where(jnp.sum(on) > count, count - max(count // 4, 1), least)
-
+        # (Where fewer are open the group is filled up with copies of the last instance.)
         advance, real = partial(advance_all, part), where < len(on)
-        found = while_more(enough, advance, jax.tree.map(taken, state), real)
-        put = lambda old, new: old.at[where].set(new, mode="drop")
-        return jax.tree.map(put, state, found)
+        return put(where, state, while_more(enough, advance, taken(where, state), real))
 
     counts = group_sizes(size, steps, work)
     for count, least in zip(counts, [*counts[1:], 0], strict=True):
@@ -503,6 +500,17 @@ def true_places(mask: Array, size: int) -> Array:
         return jnp.searchsorted(rank + 1, wanted, method="scan_unrolled").astype(jnp.int32)
     place = jnp.where(mask, jnp.minimum(rank, size), size)
     return jnp.full(size, m, jnp.int32).at[place].set(np.arange(m, dtype=np.int32), mode="drop")
+
+
+def taken(where: Array, tree: S) -> S:
+    """Return the instances at these places of a batch; the last one at places beyond its end."""
+    return jax.tree.map(lambda v: v.at[where].get(mode="clip"), tree)
+
+
+def put(where: Array, tree: S, found: Any) -> S:
+    """Return the batch with what was found at these places, but for those beyond its end."""
+    at = lambda old, new: old.at[where].set(new, mode="drop")
+    return jax.tree.map(at, tree, found)
 
 
 def broadcast(size: int, batched: Any, tree: S) -> S:

@@ -411,7 +411,7 @@ def tolerance(solver: ADMM, dtype: DTypeLike) -> Array:
     return jnp.asarray(solver.eps, dtype)
 
 
-def pair_of(qp: QP, factor: Factor, y: Array) -> tuple[QPSolution, Array]:
+def from_multipliers(qp: QP, factor: Factor, y: Array) -> tuple[QPSolution, Array]:
     """`solve_factored` for multipliers y (m,) in ADMM's coordinates that may be those of the
     solution: ITERATION_LIMIT, for nothing is measured. For hard rows, without balls; not
     differentiable."""
