@@ -62,7 +62,7 @@ from jaxmpc.qp.jax_transformations import attempted_first, compiled_lightly, own
 from jaxmpc.qp.linalg import apply, arrays, host_arrays, matmul, on_device, rounding
 from jaxmpc.qp.problem import QP, QPSolution
 from jaxmpc.qp.residuals import NEAR, SHARE, Measured, Terms, worst
-from jaxmpc.qp.solve import attempt, attempts, in_two_parts, solve_factored
+from jaxmpc.qp.solve import attempt, can_attempt, in_two_parts, solve_factored
 from jaxmpc.qp.status import Status
 from jaxmpc.sets.convex_sets import Box, Polytope
 
@@ -202,7 +202,7 @@ class Controller:
     def _plan_by(
         self, program: Callable[..., Plan], warm_start: Plan | WarmStart | None, *aim: Any
     ) -> Plan:
-        """Plan by one of the programs made of `planned_from`."""
+        """Plan by one of the programs made of `plan_for`."""
         checked = self._checked(*aim)
         if warm_start is not None:
             warm_start = arrays(WarmStart.of(warm_start, self.condensed.layout, self.mpc))
@@ -308,15 +308,17 @@ def _control(
 
 
 @own_modes
-def planned_from(controller: Controller, aim: Aim, start: WarmStart | None, *, whole: bool) -> Plan:
+def plan_for(controller: Controller, aim: Aim, start: WarmStart | None, *, whole: bool) -> Plan:
     """Return the plan of an aim; whole: see `qp.solve.in_two_parts`."""
     c, given = controller.condensed, (controller, aim, start)
-    if isinstance(c, PolicyCondensed) or not (whole and attempts(controller.solver, c.balls, c.C)):
-        return planned_by(partial(solve_factored, whole=whole), *given)[0]
+    if isinstance(c, PolicyCondensed) or not (
+        whole and can_attempt(controller.solver, c.balls, c.C)
+    ):
+        return plan_with(partial(solve_factored, whole=whole), *given)[0]
     return attempted_first(_attempt, _plan_whole, _derived, *given)[0]
 
 
-def planned_by(
+def plan_with(
     solve: Callable[..., tuple[QPSolution, Array]],
     controller: Controller,
     aim: Aim,
@@ -355,10 +357,10 @@ def planned_by(
     solution, fault = solve(qp, controller.factor, controller.solver, pair)
     found = solution if z0 is None else replace(solution, z=z0 + solution.z)
     fault = jnp.where(finite, fault, Status.NON_FINITE)
-    return planned(controller, theta, aim, found, fault, share), solution
+    return plan_of_solution(controller, theta, aim, found, fault, share), solution
 
 
-_plan_whole = jax.jit(partial(planned_by, solve_factored))
+_plan_whole = jax.jit(partial(plan_with, solve_factored))
 
 
 @jax.jit
@@ -368,17 +370,17 @@ def _attempt(
     """Return what few steps on the dual find, and whether the residuals of the plan as stated are
     as far below their tolerances as those of the QP at which the solver ends."""
     unmeasured = partial(attempt, measured=False)
-    plan, solution = found = planned_by(unmeasured, controller, aim, start, share=NEAR)
+    plan, solution = found = plan_with(unmeasured, controller, aim, start, share=NEAR)
     return found, (plan.status == Status.SOLVED) & (solution.status == Status.SOLVED)
 
 
 def _derived(found: tuple[Plan, QPSolution], *given: Any) -> tuple[Plan, QPSolution]:
-    return planned_by(partial(solve_factored, found=found[1]), *given)
+    return plan_with(partial(solve_factored, found=found[1]), *given)
 
 
-_plan = compiled_lightly(1, static_argnames="whole")(planned_from)
+_plan = compiled_lightly(1, static_argnames="whole")(plan_for)
 # Of `solve`, which makes a controller for each plan: that takes more time than the plan.
-_plan_once = compiled_lightly(0, static_argnames="whole")(planned_from)
+_plan_once = compiled_lightly(0, static_argnames="whole")(plan_for)
 
 
 def _tracked(c: Condensed, aim: Aim) -> Array | None:
@@ -418,7 +420,7 @@ def _of_rates(g: Array) -> Array:
     return g - jnp.concatenate([g[1:], jnp.zeros_like(g[:1])])
 
 
-def planned(
+def plan_of_solution(
     controller: Controller,
     theta: Array,
     aim: Aim,

@@ -47,7 +47,7 @@ from jaxmpc.batches import (
 )
 from jaxmpc.checks import fail, require_kind, require_memory, require_step_type, whole
 from jaxmpc.mpc.condense import in_float64
-from jaxmpc.mpc.controller import Controller, planned
+from jaxmpc.mpc.controller import Controller, plan_of_solution
 from jaxmpc.mpc.plan import Aim, Multipliers, Plan, flat_multipliers
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import pytree
@@ -443,4 +443,4 @@ def follow(controller: Controller, laws: Laws, cells: Cells, theta: Array) -> Pl
     found, fault = from_multipliers(c.qp(theta), f, y)
     x0, previous = jnp.split(theta, [controller.mpc.system.n])
     aim = Aim(x0, previous_input=previous if controller.mpc.input_in_state else None)
-    return planned(controller, theta, aim, found, fault)
+    return plan_of_solution(controller, theta, aim, found, fault)

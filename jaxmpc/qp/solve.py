@@ -121,12 +121,12 @@ def _solve(
     """`solve_qp`. linear: known to have P = 0, so that there are no steps on the dual."""
     made = factorise(qp.P, qp.A, solver, qp.balls)
     given = qp, made, solver, warm_start
-    if whole and not linear and attempts(solver, qp.balls, qp.A):
+    if whole and not linear and can_attempt(solver, qp.balls, qp.A):
         return with_fault(*attempted_first(_attempt, _solve_whole, _derived, *given))
     return with_fault(*solve_factored(*given, whole=whole))
 
 
-def attempts(solver: ADMM, balls: tuple[int, ...], A: Array) -> bool:
+def can_attempt(solver: ADMM, balls: tuple[int, ...], A: Array) -> bool:
     """Return whether a few steps on the dual may solve programs: else there is no `attempt`."""
     free = not solver.fixed and solver.differentiate == "implicit"
     return free and solver.most_newton_steps() >= FEW_STEPS and has_dual_steps(balls, A)
