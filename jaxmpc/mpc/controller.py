@@ -311,11 +311,10 @@ def _control(
 def plan_for(controller: Controller, aim: Aim, start: WarmStart | None, *, whole: bool) -> Plan:
     """Return the plan of an aim; whole: see `qp.solve.in_two_parts`."""
     c, given = controller.condensed, (controller, aim, start)
-    if isinstance(c, PolicyCondensed) or not (
-        whole and can_attempt(controller.solver, c.balls, c.C)
-    ):
-        return plan_with(partial(solve_factored, whole=whole), *given)[0]
-    return attempted_first(_attempt, _plan_whole, _derived, *given)[0]
+    plain = whole and not isinstance(c, PolicyCondensed)
+    if plain and can_attempt(controller.solver, c.balls, c.C):
+        return attempted_first(_attempt, _plan_whole, _derived, *given)[0]
+    return plan_with(partial(solve_factored, whole=whole), *given)[0]
 
 
 def plan_with(
