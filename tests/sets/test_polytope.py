@@ -91,6 +91,16 @@ def test_round_trips(n):
     assert image.volume() == pytest.approx(hull.volume() * abs(np.linalg.det(T)), rel=1e-11)
 
 
+def test_the_hull_of_many_points_needs_no_square_of_their_number():
+    # A full U of their singular value decomposition would have 10¹² entries.
+    angle = np.linspace(0, 2 * np.pi, 1_000_000)
+    points = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    points[::10] = [1, 1]
+    corners = Polytope.from_points(np.append(np.round(points), [[2, 0]], axis=0))
+    square = Polytope.from_points([[1, 1], [1, -1], [-1, 1], [-1, -1], [2, 0]])
+    assert corners == square
+
+
 def test_scales_and_units_do_not_matter():
     lower, upper = np.array([-1e-4, -2e3, 1000.0]), np.array([2e-4, 3e3, 1001.0])
     box = Box(lower, upper)

@@ -110,6 +110,14 @@ def test_a_tube_of_twelve_states_and_jax():
     assert slope == pytest.approx(tube.support(d), rel=1e-12)
 
 
+def test_many_generators_need_no_square_of_their_number():
+    # A full V of their singular value decomposition would have 10¹² entries.
+    G = np.full((2, 1_000_000), 1e-6)
+    segment = Zonotope([0.0, 0.0], G)
+    assert segment.affine_dimension() == 1
+    assert Polytope(*segment.half_spaces()) == Polytope.from_points([[-1, -1], [1, 1]])
+
+
 @pytest.mark.parametrize(
     ("center", "generators", "message"),
     [
