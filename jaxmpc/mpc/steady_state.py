@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jax import Array
-from scipy.optimize import lsq_linear
 
 from jaxmpc.arrays import Reals, host_array
 from jaxmpc.checks import fail, require_finite, require_shape
@@ -81,7 +81,9 @@ def equilibrium(
     if not np.all((low <= found) & (found <= high)):
         # bvls: an active-set method, exact up to rounding. Fixed entries are its open case.
         width = np.where(high > low, 0.0, 1e-12 * (1 + np.abs(high)))
-        found = lsq_linear(M, value, (low - width, high + width), method="bvls", tol=1e-15).x
+        found = scipy.optimize.lsq_linear(
+            M, value, (low - width, high + width), method="bvls", tol=1e-15
+        ).x
         found = np.clip(found, low, high)
     error = M @ found - value
     size = np.abs(M) @ np.abs(found) + np.abs(value)

@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy
-from scipy.spatial import KDTree
 
 from jaxmpc.arrays import Reals
 from jaxmpc.checks import fail
@@ -364,7 +363,11 @@ def _tops(H: np.ndarray, C: Polytope, h: np.ndarray | None = None) -> Iterator[t
     for rows, Z in factors(np.vstack([G, H]))[0]:
         own = rows < len(G)
         limits, reach, program = g[rows[own]], None, Program(Z[own], g[rows[own]])
-        near = KDTree(Z[own]).query(Z[~own])[1][::-1] if own.any() and not own.all() else []
+        near = (
+            scipy.spatial.KDTree(Z[own]).query(Z[~own])[1][::-1]
+            if own.any() and not own.all()
+            else []
+        )
         # What an elimination made comes last, and cuts most.
         for i, row, j in zip(rows[~own][::-1] - len(G), Z[~own][::-1], near, strict=True):
             reach = extent(Z[own], limits) if reach is None else reach

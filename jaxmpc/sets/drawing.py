@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
+import scipy
 
 from jaxmpc.checks import fail
 
@@ -195,8 +195,8 @@ def polygons(V: np.ndarray) -> list[np.ndarray] | None:
     if flat:
         return [V[_around(S @ axes[:2].T)]]
     try:
-        normals = np.unique(np.round(ConvexHull(S).equations, 9), axis=0)
-    except QhullError:
+        normals = np.unique(np.round(scipy.spatial.ConvexHull(S).equations, 9), axis=0)
+    except scipy.spatial.QhullError:
         return None
     found = []
     for *normal, offset in normals:

@@ -12,8 +12,6 @@ from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 import scipy
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import ConvexHull, HalfspaceIntersection, KDTree, QhullError
 
 from jaxmpc.arrays import Reals, host_array
 from jaxmpc.checks import fail, require_finite
@@ -297,15 +295,15 @@ def hull_volume(points: Reals, *, thin: bool = False) -> float:
     # Clusters confuse qhull; one point of each spans a hull that is no larger.
     scaled = scaled if thin else scaled[distinct(scaled, 1e-11)]
     try:
-        hull = ConvexHull(scaled)
-    except QhullError:  # flat
+        hull = scipy.spatial.ConvexHull(scaled)
+    except scipy.spatial.QhullError:  # flat
         if not thin:
             return 0.0
-        hull = ConvexHull(scaled, qhull_options="QJ")
+        hull = scipy.spatial.ConvexHull(scaled, qhull_options="QJ")
     return float(hull.volume * np.prod(scale))
 
 
-def dual_hull(Y: np.ndarray) -> HalfspaceIntersection:
+def dual_hull(Y: np.ndarray) -> "scipy.spatial.HalfspaceIntersection":
     """Return the vertices of {Y x <= 1} and the rows that meet in each, by a convex hull of Y
     (qhull).
 
@@ -313,7 +311,9 @@ def dual_hull(Y: np.ndarray) -> HalfspaceIntersection:
     """
     halfspaces = np.column_stack([Y, -np.ones(len(Y))])
     with explained("Polytope"), np.errstate(divide="ignore", invalid="ignore"):
-        return HalfspaceIntersection(halfspaces, np.zeros(Y.shape[1]), qhull_options=_MERGE)
+        return scipy.spatial.HalfspaceIntersection(
+            halfspaces, np.zeros(Y.shape[1]), qhull_options=_MERGE
+        )
 
 
 @contextmanager
@@ -321,14 +321,14 @@ def explained(argument: str) -> Iterator[None]:
     """Turn errors of qhull into a ValueError that names the argument."""
     try:
         yield
-    except QhullError as error:
+    except scipy.spatial.QhullError as error:
         reason = str(error).splitlines()[0]
         fail(argument, f"too ill-conditioned for qhull ({reason})", "Rescale the coordinates")
 
 
 def distinct(points: np.ndarray, tolerance: float) -> np.ndarray:
     """Return the indices of the points, of each cluster closer than `tolerance` only one."""
-    close = KDTree(points).query_pairs(tolerance, output_type="ndarray")
+    close = scipy.spatial.KDTree(points).query_pairs(tolerance, output_type="ndarray")
     return np.setdiff1d(np.arange(len(points)), close.max(axis=1, initial=-1))
 
 
@@ -357,7 +357,7 @@ def factors(Y: np.ndarray) -> tuple[list[tuple[np.ndarray, np.ndarray]], np.ndar
     row, column = np.nonzero(C)
     size = len(Y) + rank
     links = scipy.sparse.coo_array((np.ones(len(row)), (row, len(Y) + column)), (size, size))
-    count, label = connected_components(links, directed=False)
+    count, label = scipy.sparse.csgraph.connected_components(links, directed=False)
     rows, columns = label[: len(Y)], label[len(Y) :]
     parts = []
     for part in range(count):

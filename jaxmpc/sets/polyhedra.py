@@ -3,7 +3,6 @@ float64: what `geometry` does with sets that have volume, carried over to these.
 
 import numpy as np
 import scipy
-from scipy.spatial import ConvexHull, Delaunay, QhullError
 
 from jaxmpc.checks import fail
 from jaxmpc.sets.geometry import (
@@ -151,7 +150,7 @@ def _full_hull(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return np.array([[1.0], [-1.0]]), np.array([points.max(), -points.min()])
     # qhull's facets are simplices: a facet with more corners comes several times.
     with explained("points"):
-        facets = ConvexHull(points).equations
+        facets = scipy.spatial.ConvexHull(points).equations
     facets = facets[distinct(facets, 1e-10)]
     return facets[:, :-1], -facets[:, -1]
 
@@ -216,9 +215,9 @@ def triangulation(vertices: np.ndarray) -> np.ndarray:
         return np.array([[[vertices.min()], [vertices.max()]]])
     scaled = (vertices - vertices.mean(axis=0)) / np.ptp(vertices, axis=0)
     try:
-        return vertices[Delaunay(scaled).simplices]
-    except QhullError:
-        return vertices[Delaunay(scaled, qhull_options="QJ").simplices]
+        return vertices[scipy.spatial.Delaunay(scaled).simplices]
+    except scipy.spatial.QhullError:
+        return vertices[scipy.spatial.Delaunay(scaled, qhull_options="QJ").simplices]
 
 
 def simplex_volumes(simplices: np.ndarray) -> np.ndarray:
