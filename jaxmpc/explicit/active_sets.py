@@ -21,7 +21,7 @@ import contextlib
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import nnls
+import scipy
 
 from jaxmpc.checks import fail
 from jaxmpc.explicit.parametric_program import (
@@ -167,7 +167,7 @@ class LeastDistanceForm:
                 # |y| ≥ worst, which therefore serves as the unit of length.
                 E = -np.vstack([self.M[moving].T, (b[moving] + allowance) / worst])
                 try:
-                    u, _ = nnls(E, np.eye(len(E))[-1], maxiter=20 * E.shape[1])
+                    u, _ = scipy.optimize.nnls(E, np.eye(len(E))[-1], maxiter=20 * E.shape[1])
                 except RuntimeError:
                     continue
                 active = tuple(moving[np.flatnonzero(u)].tolist())

@@ -8,7 +8,7 @@ region.
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import lsq_linear, nnls
+import scipy
 
 from jaxmpc.explicit.regions import CriticalRegions
 from jaxmpc.mpc.condense import Inequalities, condensed_in_float64
@@ -157,9 +157,9 @@ class Law:
         if not A.shape[1]:
             return np.zeros(0)
         if np.any(np.isfinite(rho)):
-            return lsq_linear(A, force, (0, rho)).x
+            return scipy.optimize.lsq_linear(A, force, (0, rho)).x
         try:
-            return nnls(A, force, maxiter=20 * A.shape[1])[0]
+            return scipy.optimize.nnls(A, force, maxiter=20 * A.shape[1])[0]
         except RuntimeError:  # no multipliers, which the check of the plan notices
             return np.zeros(A.shape[1])
 

@@ -12,7 +12,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.optimize import nnls
+import scipy
 
 from jaxmpc.checks import fail
 from jaxmpc.mpc.condense import Inequalities, row_lengths
@@ -88,7 +88,7 @@ class CenteredPolytope:
             scale = -room[i].min()
             E = -np.vstack([normals.T, room[i] / scale])
             try:
-                y, _ = nnls(E, target, maxiter=20 * E.shape[1])
+                y, _ = scipy.optimize.nnls(E, target, maxiter=20 * E.shape[1])
             except RuntimeError:  # stays outside, where there is no plan
                 continue
             r = E @ y - target

@@ -7,8 +7,8 @@ contacts and dry friction do not help. What was found is tried on the file.
 import copy
 
 import numpy as np
+import scipy
 from scipy.linalg import block_diag
-from scipy.optimize import least_squares, lsq_linear
 
 from jaxmpc.checks import fail
 from jaxmpc.pytrees import record
@@ -177,7 +177,7 @@ def rest_at(robot: RobotDescription, q: np.ndarray, *, within: bool = False) -> 
     drive = np.linalg.lstsq(J, -f, rcond=None)[0]
     if within and np.any((drive < forces.lower) | (drive > forces.upper)):
         wide = np.where(forces.upper > forces.lower, 0.0, 1e-12)
-        drive = lsq_linear(J, -f, (forces.lower - wide, forces.upper + wide)).x
+        drive = scipy.optimize.lsq_linear(J, -f, (forces.lower - wide, forces.upper + wide)).x
         drive = np.clip(drive, forces.lower, forces.upper)
     return forces.rest(q, drive, f)
 
@@ -209,7 +209,7 @@ def _standing(forces: Forces, feet: Feet, q: np.ndarray) -> Rest:
     aim = np.append(-balance * f, np.zeros(forces.m + len(on_feet)))
     lower = np.append(forces.lower, np.zeros(R.shape[1]))
     upper = np.append(forces.upper, np.full(R.shape[1], np.inf))
-    found = lsq_linear(rows, aim, (lower, upper), method="bvls", tol=1e-15)
+    found = scipy.optimize.lsq_linear(rows, aim, (lower, upper), method="bvls", tol=1e-15)
     drive, r = np.split(found.x, [forces.m])
     missing = forces.at(q, drive) + G.T @ (R @ r)
     return Rest(q, *forces.parts(drive), drive, forces.lower, forces.upper, missing, size)
@@ -452,7 +452,7 @@ def _searched(robot: RobotDescription, forces: Forces, q: np.ndarray, motion: np
     scale = np.append(np.ones(len(low)), near.width)
     for weight in _WEIGHTS:
         options = {"args": (weight,), "bounds": (lower, upper), "x_scale": scale, **tight}
-        found = least_squares(near.residual, z, near.jacobian, **options)
+        found = scipy.optimize.least_squares(near.residual, z, near.jacobian, **options)
         z = np.clip(found.x, lower + inset, upper - inset)
     position = near.position(z)
     J, f = forces.affine(position)
