@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
 import jaxmpc as jm
 from jaxmpc.mpc import NonlinearMPC, Task, solve_nonlinear, solve_stagewise
@@ -120,6 +121,14 @@ def test_a_plan_is_traced_without_implicit_promotion():
     """The modes act on what is traced, so that nothing need be compiled here."""
     with jax.numpy_rank_promotion("raise"), jax.numpy_dtype_promotion("strict"):
         jax.jit(many("plan")).trace(XS)
+
+
+def test_a_batch_on_a_mesh_with_explicit_axes_that_is_not_the_context():
+    """Arrays have the axes in their type without `jax.set_mesh` too."""
+    mesh = jax.make_mesh((1,), ("b",), axis_types=(AxisType.Explicit,))
+    batch = jax.device_put(XS, NamedSharding(mesh, PartitionSpec("b")))
+    found = jax.jit(many("plan")).trace(batch).out_info
+    assert found.inputs.shape == (len(XS), 3, 1)
 
 
 @pytest.mark.slow

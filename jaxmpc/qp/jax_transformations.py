@@ -29,7 +29,14 @@ import numpy as np
 from jax import Array, lax
 from jax.custom_batching import custom_vmap
 from jax.extend.core import ClosedJaxpr
-from jax.sharding import AxisType, PartitionSpec, auto_axes, get_abstract_mesh
+from jax.sharding import (
+    AbstractMesh,
+    AxisType,
+    NamedSharding,
+    PartitionSpec,
+    auto_axes,
+    get_abstract_mesh,
+)
 
 from jaxmpc.checks import concrete
 
@@ -85,14 +92,24 @@ def own_modes(function: F) -> F:
     @functools.wraps(function)
     def run(*args: Any, **kwargs: Any) -> Any:
         with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
-            if AxisType.Explicit in get_abstract_mesh().axis_types:
-                return _without_explicit_axes(functools.partial(function, **kwargs), args)
+            mesh = _explicit_mesh(args)
+            if mesh is not None:
+                return _without_explicit_axes(functools.partial(function, **kwargs), args, mesh)
             return varying(function(*varying(args, args), **kwargs), args)
 
     return run  # type: ignore[return-value]
 
 
-def _without_explicit_axes(function: Callable[..., Any], args: tuple) -> Any:
+def _explicit_mesh(args: tuple) -> AbstractMesh | None:
+    """Return the mesh with explicit axes, of the context or of an argument, None for none.
+
+    (Arrays keep their sharding as a part of their type where no `jax.set_mesh` is in force.)"""
+    arrays = [v for v in jax.tree.leaves(args) if isinstance(v, jax.Array)]
+    meshes = [get_abstract_mesh(), *(jax.typeof(v).sharding.mesh for v in arrays)]
+    return next((mesh for mesh in meshes if AxisType.Explicit in mesh.axis_types), None)
+
+
+def _without_explicit_axes(function: Callable[..., Any], args: tuple, mesh: AbstractMesh) -> Any:
     leaves, tree = jax.tree.flatten(args)
     places = [i for i, v in enumerate(leaves) if isinstance(v, jax.Array)]  # not what is static
 
@@ -101,7 +118,8 @@ def _without_explicit_axes(function: Callable[..., Any], args: tuple) -> Any:
         full = [given.get(i, v) for i, v in enumerate(leaves)]
         return function(*jax.tree.unflatten(tree, full))
 
-    return auto_axes(call, out_sharding=PartitionSpec())(*(leaves[i] for i in places))
+    everywhere = NamedSharding(mesh, PartitionSpec())
+    return auto_axes(call, out_sharding=everywhere)(*(leaves[i] for i in places))
 
 
 def varying(tree: T, like: Any) -> T:
