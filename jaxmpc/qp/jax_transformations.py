@@ -328,7 +328,8 @@ def attempted_first(
     again(result, *arguments): the same result, computed from itself, with its derivatives. The
     functions must close over no arrays, and the first two be programs of `jax.jit`, traced once.
     """
-    one = custom_vmap(lambda *arguments: whole(*arguments))
+    # (What has no batch must vary over the axes over which results of the rule do.)
+    one = custom_vmap(own_modes(lambda *arguments: whole(*arguments)))
 
     @one.def_vmap
     @own_modes
@@ -371,7 +372,7 @@ def _attempted(
         rest = iter(own)
         return [next(rest) if b else v for v, b in zip(leaves, batched, strict=True)]
 
-    found, done = map_blocks(lambda own: attempt(*given(own)), own)
+    found, done = varying(map_blocks(lambda own: attempt(*given(own)), own), own)
 
     def solve_some(carry: tuple[R, Array]) -> tuple[R, Array]:
         where = true_places(carry[1], LEFT_CPU)
@@ -383,7 +384,7 @@ def _attempted(
 def _of_one_batch(run: Callable[..., R], batched: tuple[bool, ...]) -> Callable[..., R]:
     """Return `run`, of whose arguments some are `batched`, which works a further batch off as one
     with the first."""
-    batch = custom_vmap(lambda *leaves: run(*leaves))
+    batch = custom_vmap(own_modes(lambda *leaves: run(*leaves)))
 
     @batch.def_vmap
     @own_modes

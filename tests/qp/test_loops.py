@@ -1,9 +1,12 @@
 """Loops that instances leave one by one, against plain Python; answers beside their neighbours."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.sharding import AxisType, PartitionSpec
 
 import jaxmpc as jm
 from jaxmpc.qp import jax_transformations
@@ -89,6 +92,19 @@ def test_an_attempt_goes_first(count, shared):
     np.testing.assert_array_equal(way, (n % 2 == 0) if count > BLOCK else 0 * n)
     total = lambda factor: jnp.sum(batch(factor, n)[0])
     np.testing.assert_array_equal(jax.jit(jax.grad(total))(factor), jnp.sum(n) if shared else n)
+
+
+@pytest.mark.parametrize("count", [5, 300])
+def test_an_attempt_in_a_shard_map(count):
+    """What is the same for all instances varies over the mesh, where others do."""
+    mesh, spec = jax.make_mesh((1,), ("b",), axis_types=(AxisType.Auto,)), PartitionSpec("b")
+    both = lambda function: jax.vmap(jax.value_and_grad(function, has_aux=True))
+    batch = both(jax.jit(partial(product, jnp.float32(3))))
+    n = jnp.arange(float(count))
+    (found, way), slope = jax.jit(jax.shard_map(batch, mesh=mesh, in_specs=spec, out_specs=spec))(n)
+    np.testing.assert_array_equal(found, 3 * n)
+    np.testing.assert_array_equal(way, (n % 2 == 0) if count > BLOCK else 0 * n)
+    np.testing.assert_array_equal(slope, 3)
 
 
 @pytest.mark.parametrize("axes", [(None, 0), (0, 0), (0, None)])
