@@ -373,10 +373,14 @@ def _attempted(
         return [next(rest) if b else v for v, b in zip(leaves, batched, strict=True)]
 
     found, done = varying(map_blocks(lambda own: attempt(*given(own)), own), own)
+    # Groups are filled up with copies of one that does not take long, or with different ones.
+    size, short = len(done), true_places(done, 1)[0]
+    others = jnp.where(short < size, short, np.arange(LEFT_CPU, dtype=np.int32))
 
     def solve_some(carry: tuple[R, Array]) -> tuple[R, Array]:
         where = true_places(carry[1], LEFT_CPU)
-        return put(where, carry, (whole(*given(taken(where, own))), False))
+        group = taken(jnp.where(where < size, where, others), own)
+        return put(where, carry, (whole(*given(group)), False))
 
     return lax.while_loop(lambda carry: jnp.any(carry[1]), solve_some, (found, ~done))[0]
 
