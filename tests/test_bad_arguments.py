@@ -397,7 +397,7 @@ CALLS = [
     ("A: 'A' where real numbers are", lambda: jm.LinearSystem("A", B).validate()),
     ("A: None where real numbers are", lambda: jm.LinearSystem(None, B).validate()),
     ("A: shape (2,) is not (n, n). Give a", lambda: jm.LinearSystem([1, 2], B).validate()),
-    ("A: shape () is not (n, n). Give a", lambda: jm.LinearSystem(1.0, 1.0).validate()),
+    ("A: shape () is not (n, n). Give a matrix, [[", lambda: jm.LinearSystem(1.0, 1.0).validate()),
     ("A: shape (2, 3) where (3, 3) is", lambda: jm.LinearSystem(np.zeros((2, 3)), B).validate()),
     ("A: entries of type complex128 where", lambda: jm.LinearSystem(A * 1j, B).validate()),
     ("A: holds NaN or infinity. Give", lambda: jm.LinearSystem(A * np.nan, B).validate()),
@@ -490,7 +490,7 @@ CALLS = [
         lambda: jm.map_feasible_set(M, np.zeros((3, 1)), axes=(0.5,)),
     ),
     (
-        "fixed: shape (3,). Give a value for each of the other states, (1,), or of all, (2,)",
+        "fixed: shape (3,). Give a value for each of x2, (1,), or of all, (2,)",
         lambda: jm.map_feasible_set(M, np.zeros((3, 1)), axes=(0,), fixed=[1, 2, 3]),
     ),
     (

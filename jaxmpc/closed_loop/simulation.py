@@ -475,9 +475,10 @@ def simulate_many(
         require_untraced(argument, value, cure)
     require_real("x0s", x0s)
     x0s, variations = np.asarray(x0s), dict(variations or {})
-    if x0s.ndim != 2 or not len(x0s):
-        size = getattr(controller, "state_size", "n")
-        fail("x0s", f"shape {x0s.shape}", f"Give (B, {size}), B ≥ 1")
+    size = getattr(controller, "state_size", None)
+    if x0s.ndim != 2 or not len(x0s) or size not in (None, x0s.shape[1]):
+        cure = f"Give (B, {size or 'n'}), B ≥ 1, one initial state a row"
+        fail("x0s", f"shape {x0s.shape}", cure)
     require_variations(plant, variations, len(x0s))
     if chunk is not None and chunk < 1:
         fail("chunk", f"{chunk}", "Give a count of at least 1")

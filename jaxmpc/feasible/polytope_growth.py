@@ -72,10 +72,16 @@ def any_policy_polytope(mpc: MPC) -> Polytope:
     require_kind("mpc", mpc, MPC)
     mpc.validate()
     mpc.require_constant("steps back from the terminal set are all the same", *HARD)
-    plain = replace(mpc, soft=(), control_horizon=None, input_rate_limit=None)
-    if not is_standard_form(plain) or not mpc.constrain_initial or mpc.states is None:
-        what = "has other limits than those of states, inputs and their rates at the usual steps"
-        fail("mpc", what, "Give it without them")
+    if mpc.states is None:
+        fail("states", "is None, and the steps back begin with their limits", "Give limits")
+    for name, given, usual in (
+        ("outputs", bool(mpc.outputs), ()),
+        ("constrained_stages", mpc.constrained_stages is not None, None),
+        ("constrain_initial", not mpc.constrain_initial, True),
+    ):
+        if given:
+            what = "is given, and the steps back have limits of states, inputs and rates alone"
+            fail(name, what, f"Give dataclasses.replace(mpc, {name}={usual}) for an outer bound")
     if isinstance(mpc.terminal_set, Ellipsoid):
         fail("terminal_set", "is an Ellipsoid, which has no facets", "Give a Polytope")
     if mpc.rate_limited:

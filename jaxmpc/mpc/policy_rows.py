@@ -165,9 +165,10 @@ def require_free_inputs(mpc: MPC) -> None:
 
 
 def require_generators(W: Any) -> None:
-    """Raise ValueError unless affine policies can answer to the disturbances of a set."""
+    """Raise ValueError unless a set has generators, as affine policies and the rows that limit the
+    rates of tubes need."""
     if not isinstance(W, Box | Zonotope):
-        what = f"is a {type(W).__name__}, and affine policies answer to generators"
+        what = f"is a {type(W).__name__}, which has no generators, as this policy needs them"
         fail("disturbance", what, 'Give a Box or a Zonotope, or policy="tightened"')
 
 

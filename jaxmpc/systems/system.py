@@ -124,7 +124,9 @@ class LinearSystem:
         for name, value, shape in (("A", A, "(n, n)"), ("B", B, "(n, m)")):
             given = np.shape(value)
             if len(given) != 2 or 0 in given:
-                cure = "Give a matrix; one for each step is known to an MPC alone"
+                cure = "Give a matrix, [[1.0]] for the number 1"
+                if len(given) > 2:
+                    cure = "Give one matrix; one for each step is known to an MPC alone"
                 fail(name, f"shape {given} is not {shape}", cure)
         n, m = self.n, self.m
         require_shape("A", A, (n, n), "A must be square")

@@ -395,6 +395,9 @@ def operations(jaxpr: Any) -> float:
 
 def controller_of(make_mpc: Any, given: Mapping[str, Any], solver: ADMM) -> Any:
     """Return the controller at these values: that of make_mpc, or a Controller of its problem."""
+    if not callable(make_mpc):
+        cure = "Give a function of the values, such as lambda v: dataclasses.replace(mpc, Q=v['Q'])"
+        fail("make_mpc", f"is a {type(make_mpc).__name__}", cure)
     made = make_mpc(given)
     if isinstance(made, MPC):
         return Controller(made, solver)

@@ -380,7 +380,7 @@ def test_bad_loops_are_named(pendulum, linear_mpc):
     for call, message in (
         (lambda: many(law, PLANT, x0s[0], 5), r"x0s: shape \(2,\). Give \(B, 2\)"),
         (lambda: many(law, PLANT, x0s[:0], 5), "x0s: shape .0, 2."),
-        (lambda: many(law, PLANT, np.zeros((4, 3)), 5), "x0: shape .3,."),
+        (lambda: many(law, PLANT, np.zeros((4, 3)), 5), r"x0s: shape .4, 3.. Give \(B, 2\)"),
         (lambda: many(law, PLANT, x0s, 0), "steps: 0. Give a whole number"),
         (lambda: many(law, PLANT, x0s, 2.5), "steps: 2.5"),
         (lambda: many(law, PLANT, x0s, 5, chunk=0), "chunk: 0. Give a count of at least 1"),

@@ -211,9 +211,14 @@ def test_the_double_integrator_of_the_literature():
     np.testing.assert_allclose(exact.volume(), 35.7903, atol=5e-5)
     any_policy = any_policy_polytope(mpc)
     np.testing.assert_allclose(any_policy.volume(), exact.volume(), rtol=1e-12)
-    with pytest.raises(ValueError, match="has other limits"):
-        outputs = jm.mpc.Outputs([[1.0, 1.0]], upper=[5.0])
-        any_policy_polytope(double(policy="tightened", outputs=outputs))
+    for name, value in (
+        ("outputs", jm.mpc.Outputs([[1.0, 1.0]], upper=[5.0])),
+        ("constrained_stages", (1, 2)),
+        ("constrain_initial", False),
+        ("states", None),
+    ):
+        with pytest.raises(ValueError, match=f"^{name}: is"):
+            any_policy_polytope(double(policy="tightened", **{name: value}))
     found = feasible_polytope(mpc)
     assert found.is_subset(exact, 1e-7)
     np.testing.assert_allclose(found.volume(), 35.7903, atol=1e-4)
@@ -269,7 +274,7 @@ def test_slices_and_recursion():
         ({"input_rate_limit": 1.0}, "Give points .B, 3.: states, then previous inputs"),
         ({"inputs": None}, "inputs: are in no bounded Box"),
         ({"gain": K}, "gain: given with affine policies"),
-        ({"disturbance": W.to_polytope()}, "affine policies answer to generators"),
+        ({"disturbance": W.to_polytope()}, "has no generators"),
         ({"disturbance": jm.sets.Zonotope([0, 0], np.ones((2, 3)))}, "depend on each other"),
         ({"terminal_set": jm.Box([2.0, -2.0], [5.0, -1.9])}, "is empty or flat"),
     ],

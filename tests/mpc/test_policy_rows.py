@@ -477,7 +477,7 @@ def test_soft_rows_rates_and_blocks(policy, fields):
     [
         ({"policy": "tube", "control_horizon": 2}, "control_horizon: given with policy 'tube'"),
         ({"disturbance": jm.Polytope([[1.0, 1.0], [-1.0, 0.0], [0.0, -1.0]], [0.1] * 3)},
-         "disturbance: is a Polytope, and affine policies answer to generators"),
+         "disturbance: is a Polytope, which has no generators, as this policy needs them"),
         ({"policy": "tube", "disturbance": jm.Box([-1.0, -1.0], [1.0, 1.0])},
          "disturbance: takes more than there is of input"),
         ({"policy": "tube", "gain": [[0.0, 0.0]]}, "K: A . BK has spectral radius"),

@@ -292,14 +292,17 @@ def check(config: Config, command: str = "sweep") -> None:
         given = config.disturbance
         _check_order("disturbance", given, "w_min", "w_max")
         p = n if given.E is None else len(given.E[0])
+        for key, shape, cure in (
+            ("E", (n, p), f"Give ({n}, p), one row a state, one column a disturbance"),
+            ("gain", (m, n), f"Give {(m, n)}"),
+        ):
+            value = getattr(given, key)
+            if value is not None and np.shape(value) != shape:
+                fail(f"disturbance.{key}", f"shape {np.shape(value)}", cure)
         for key, size in (("w_min", p), ("w_max", p)):
             if len(getattr(given, key)) != size:
                 what = f"has {len(getattr(given, key))} entries where {size} are needed"
                 fail(f"disturbance.{key}", what, "One for each column of E, without E each state")
-        for key, shape in (("E", (n, p)), ("gain", (m, n))):
-            value = getattr(given, key)
-            if value is not None and np.shape(value) != shape:
-                fail(f"disturbance.{key}", f"shape {np.shape(value)}", f"Give {shape}")
     for i, rows in enumerate(config.outputs):
         where = f"outputs.{i}"
         if rows.lower is None and rows.upper is None:
