@@ -122,7 +122,10 @@ def export_explicit_c(
     require_kind("regions", regions, CriticalRegions, cure=cure)
     files = CFiles.open(folder, name, dtype, tolerance, TOLERANCE, overwrite)
     if not regions.complete:
-        cure = "Raise max_regions or seconds"
+        cure = (
+            "Raise max_regions or seconds where these ended the search; else shorten the horizon, "
+            "or export a fixed number of steps (export_c, --law steps)"
+        )
         fail("regions", f"are not all of the law ({regions.reason})", cure)
     if regions.window is not None or regions.tied:
         what = "unbounded" if regions.window is not None else "flat"

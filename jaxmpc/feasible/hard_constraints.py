@@ -84,8 +84,8 @@ def make_view(mpc: MPC, axes: Axes = None, fixed: Reals | None = None) -> View:
     if fixed is not None and others:
         given, values = host_array("fixed", fixed), np.zeros(n)
         if given.shape not in ((n,), (len(others),)):
-            names = ", ".join(mpc.labels[i] for i in others)
-            cure = f"Give a value for each of {names}, ({len(others)},), or of all, ({n},)"
+            which = ", ".join(mpc.labels[i] for i in others)
+            cure = f"Give a value for each of {which}, ({len(others)},), or of all, ({n},)"
             fail("fixed", f"shape {given.shape}", cure)
         values[list(others)] = given if len(given) < n else given[list(others)]
         require_finite("fixed", values)

@@ -58,7 +58,7 @@ def test_it_makes_a_robust_problem_that_is_read_back(tmp_path):
         ("w_min = [-0.2, -0.2]", "w_min = [0.3, 0.0]", "disturbance.w_min: entry 0 is 0.3"),
         ("[disturbance]", "[disturbance]\ngain = [[1.0]]", "disturbance.gain: shape"),
         ("[disturbance]", "[disturbance]\nE = [[1.0, 0.0]]", "disturbance.E: shape"),
-        ("[disturbance]", "[disturbance]\nE = [[1.0, 0.0, 0.0]]", r"E: shape \(1, 3\). Give \(2, p\)"),
+        ("[disturbance]", "[disturbance]\nE = [[1.0, 0, 0]]", r"E: shape \(1, 3\). Give \(2, p\)"),
         ("[disturbance]", '[disturbance]\npolicy = "none"', "disturbance.policy"),
         (
             "u_max = [1.0]",

@@ -83,7 +83,7 @@ def test_closed_loop_is_the_solvers(tmp_path):
 
 
 def test_bad_input(regions, tmp_path):
-    with pytest.raises(ValueError, match="regions: are not all of the law"):
+    with pytest.raises(ValueError, match="regions: are not all of the law.*export_c, --law steps"):
         export_explicit_c(replace(regions, complete=False, reason="stopped"), tmp_path)
     with pytest.raises(ValueError, match="name: '2x'"):
         export_explicit_c(regions, tmp_path, name="2x")
