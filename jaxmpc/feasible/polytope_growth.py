@@ -81,7 +81,7 @@ def any_policy_polytope(mpc: MPC) -> Polytope:
     ):
         if given:
             what = "is given, and the steps back have limits of states, inputs and rates alone"
-            fail(name, what, f"Give dataclasses.replace(mpc, {name}={usual}) for an outer bound")
+            fail(name, what, f"Ask about dataclasses.replace(mpc, {name}={usual})")
     if isinstance(mpc.terminal_set, Ellipsoid):
         fail("terminal_set", "is an Ellipsoid, which has no facets", "Give a Polytope")
     if mpc.rate_limited:
