@@ -124,7 +124,7 @@ def _tables(controller: Controller) -> dict[str, Any]:
     if not isinstance(c, PolicyCondensed):
         N = mpc.horizon
         later = [mpc.moves[b + 1] if b + 1 < N else -1 for b in c.begins]
-        tables |= jax.tree.map(np.asarray, _of_warm_starts(controller))
+        tables |= jax.tree.map(np.asarray, _of_starts(controller))
         tables["later_move"] = np.array(later, int)
         tables["later_row"] = tables["later_row"].astype(int) - 1
     return {key: np.asarray(value) for key, value in tables.items()}
@@ -175,8 +175,8 @@ def _computed(controller: Controller) -> dict[str, Any]:
 
 
 @jax.jit
-def _of_warm_starts(controller: Controller) -> dict[str, Any]:
-    """The tables by which a plan begins with the one before.
+def _of_starts(controller: Controller) -> dict[str, Any]:
+    """The tables by which a plan begins with its references or with the plan before.
 
     later_row: number of the row of the last plan, from 1, whose multiplier each row begins with, 0
     for none: what `Controller.shifted` does to multipliers that are the numbers of their rows."""
@@ -184,8 +184,11 @@ def _of_warm_starts(controller: Controller) -> dict[str, Any]:
     assert c is not None
     N, n, m = mpc.horizon, mpc.system.n, mpc.system.m
     numbers = jnp.arange(1.0, c.C.shape[0] + 1)
-    start = WarmStart(jnp.zeros((N + 1, n)), jnp.zeros((N, m)), numbers)
+    states, inputs = jnp.zeros((N + 1, n)), jnp.zeros((N, m))
+    start = WarmStart(states, inputs, numbers)
     tables = {
+        "z_state": jax.jacfwd(lambda r: c.variables(states + r, inputs))(states[0]),
+        "z_input": jax.jacfwd(lambda r: c.variables(states, inputs + r))(inputs[0]),
         "end_theta": c.Phi[N],
         "end_z": c.Gamma[N],
         "end_constant": c.phi[N],

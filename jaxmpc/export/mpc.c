@@ -183,6 +183,13 @@ int NAME_step(NAME_memory *memory, const real x[N], const real *state_reference,
   }
   offset(0, q, move, b);
 #if NAME_WARM
+  if (state_reference || input_reference) { /* cold, steps begin where these are followed */
+    memset(z, 0, sizeof z);
+    if (state_reference) product(NZ, N, z_state, state_reference, 1, z);
+    if (input_reference) product(NZ, MU, z_input, input_reference, 1, z);
+    product(M, NZ, C, z, 0, t);
+    for (int i = 0; i < M; i++) t[i] *= E[i];
+  }
   if (memory->warm) {
     /* From the last plan only where it is nearer than nothing: where the first step is shorter. */
     real warm[M + 1], near = 0, cold = 0;
