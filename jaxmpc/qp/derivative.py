@@ -11,6 +11,8 @@ Which element of the generalised derivative is taken, and what it means where no
 * A hard row counts as active where it has a multiplier. One that only touches, y = 0, counts as
   inactive. An equality is always active; its multiplier's sign says which of l, u it follows (each
   by half where y = 0).
+* A soft row with a multiplier below the L1 weight c, 0 < |y| < c, is at its limit, whatever the
+  rounding of Az, which is large beside y/ρ where y is small (in float32 above all).
 * Smoothing μ > 0 replaces the 0 or 1 of "active" by k/(ρ + k), k = Σ μ/s² over both sides, with
   the slacks s = (τ + √(τ² + 4μ))/2, τ = slack − multiplier, of the central path (Chen, Harker,
   Kanzow, Smale): the stiffness of a log barrier. (z, y) stay those of the exact solution;
@@ -59,15 +61,16 @@ def dense_conditions(
     v, y_w = p.scaled_rows(z, y)
     # μ is a product of a slack and a multiplier, each of which is measured in the unit.
     upper, lower, others = activity(bounds, v, y_w, smoothing / unit**2, rho)
+    rounding = off_limit(bounds, v, y_w)
 
     def conditions(qp: QP) -> tuple[Array, Array]:
         bounds = qp.bounds.scaled(E).divided(unit)
         v = E * matmul(z, qp.A.T) / unit
         sides = upper * (v - bounds.u) + lower * (v - bounds.l)
-        rows = jnp.where(others, bounds.prox_residual(v + y_w / rho, rho), sides)
+        rows = jnp.where(others, bounds.prox_residual(v - rounding + y_w / rho, rho), sides)
         return matmul(matmul(z, qp.P) + qp.q + matmul(y, qp.A), T) / unit, rows
 
-    weights, normals = bounds.curvature(v + y_w / rho, rho)
+    weights, normals = bounds.curvature(v - rounding + y_w / rho, rho)
     weights = jnp.where(others, weights, upper + lower)
     inverse = linearised(H, A, weights, normals, rho, factor.flat)
 
@@ -76,6 +79,23 @@ def dense_conditions(
         return unit * matmul(dw, T.T), unit * E * dy
 
     return conditions, undo
+
+
+def above_rounding(y: Array) -> Array:
+    """Return which multipliers (m,) are above the level of rounding."""
+    return jnp.abs(y) > jnp.finfo(y.dtype).eps ** 0.75 * (1 + jnp.max(jnp.abs(y), initial=0.0))
+
+
+def off_limit(bounds: Bounds, v: Array, y: Array) -> Array:
+    """Return the rounding of v (m,): its distance from the limit at which a soft row is that pays
+    no penalty, 0 < |y| < c; 0 in other rows."""
+    if bounds.linear is None:
+        return jnp.zeros_like(v)
+    precision, limit = jnp.finfo(v.dtype).eps, jnp.where(y > 0, bounds.u, bounds.l)
+    unpaid = above_rounding(y) & (jnp.abs(y) < (1 - precision**0.75) * bounds.linear)
+    near = jnp.abs(v - limit) <= 0.1 * jnp.sqrt(precision) * (1 + jnp.abs(v))
+    here = unpaid & near & jnp.isfinite(bounds.linear)
+    return jax.lax.stop_gradient(jnp.where(here, v - limit, 0.0))
 
 
 class Activity(NamedTuple):
@@ -94,8 +114,7 @@ def activity(bounds: Bounds, v: Array, y: Array, smoothing: float | Array, rho: 
     if bounds.linear is not None:
         others = others | jnp.isfinite(bounds.linear)
 
-    # Multipliers at rounding level are none.
-    has_multiplier = jnp.abs(y) > precision**0.75 * (1 + jnp.max(jnp.abs(y), initial=0.0))
+    has_multiplier = above_rounding(y)
     out = jax.lax.stop_gradient(bounds.violation(v))
     spring = (y * out > 0) & (jnp.abs(out) > 0.1 * jnp.sqrt(precision) * (1 + jnp.abs(v)))
     k = jax.lax.stop_gradient(jnp.where(spring, y / jnp.where(spring, out, 1.0), 0.0))

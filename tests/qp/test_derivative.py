@@ -16,7 +16,8 @@ import pytest
 from jax import enable_x64
 
 import jaxmpc as jm
-from jaxmpc.qp.derivative import linearised
+from jaxmpc.qp.admm import factorise
+from jaxmpc.qp.derivative import dense_conditions, linearised
 
 INF = np.inf
 # Without the polish a program compiles several times faster; ADMM alone converges on easy ones.
@@ -734,6 +735,32 @@ class TestKinks:
             assert -0.99 < of_q < -0.01
             assert 0.01 < of_u < 0.99
             assert -0.99 < of_a < -0.01
+
+    def test_small_multipliers_of_soft_rows_in_float32(self):
+        """min ½|z − t|² + max(a'z − b, 0) at a'z = b with a multiplier of about 10⁻⁴ of z, of whose
+        size the rounding of a'z seems to be: dz/dt is the projection on the row."""
+        rng = np.random.default_rng(0)
+        a, z = rng.normal(size=(1024, 3)), 10 * rng.normal(size=(1024, 3))
+        a /= np.linalg.norm(a, axis=1, keepdims=True)
+        y = rng.uniform(0.8e-4, 1.2e-4, 1024) * np.abs(z).max(axis=1)
+        t, b = z + y[:, None] * a, np.sum(a * z, axis=1)
+
+        @jax.jit
+        @jax.vmap
+        def derivative(t, a, b, z, y):
+            one = np.ones(1, np.float32)
+            soft = {"soft_linear": one, "soft_quadratic": 0 * one}
+            qp = jm.QP(np.eye(3, dtype=np.float32), -t, a[None], -INF * one, b[None], **soft)
+            factor = factorise(qp.P, qp.A, jm.ADMM())
+            conditions, undo = dense_conditions(qp, (factor, 0.0), z, y[None])
+            along = lambda t: conditions(replace(qp, q=-t))
+            return jax.vmap(lambda d: undo(jax.jvp(along, (t,), (d,))[1])[0])(
+                np.eye(3, dtype=np.float32)
+            )
+
+        found = derivative(*map(np.float32, (t, a, b, z, y)))
+        expected = np.eye(3) - a[:, :, None] * a[:, None, :]
+        np.testing.assert_allclose(found, expected, atol=1e-5)
 
     def test_smoothing_of_many_rows(self, x64):
         """Every field of a program away from kinks: μ → 0 gives the exact derivative."""
