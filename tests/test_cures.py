@@ -60,7 +60,9 @@ def test_points_of_a_map_with_limited_rates():
     )
     np.testing.assert_array_equal(short.fixed, [0, 0, 0.1])
     np.testing.assert_array_equal(whole.fixed, short.fixed)
-    with pytest.raises(ValueError, match=r"fixed: shape \(2,\).*other states, \(1,\), or of all"):
+    with pytest.raises(
+        ValueError, match=r"fixed: shape \(2,\).*each of previous u1, \(1,\), or of all"
+    ):
         jm.map_feasible_set(mpc, np.zeros((3, 2)), axes=[0, 1], fixed=[0, 0])
     meaning = short.to_xarray().bound_normal.attrs["long_name"]
     assert meaning == "a of a half-space a'x <= b that holds all feasible states"

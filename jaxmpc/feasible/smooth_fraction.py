@@ -80,7 +80,7 @@ def membership(
     x0s, width = arrays((x0s, width))
     if x0s.ndim != 2 or x0s.shape[1] != mpc.dimension:
         fail("x0s", f"shape {x0s.shape}", f"Give states (B, {mpc.dimension}), one a row")
-    if concrete(width) and not (np.ndim(width) == 0 and 0 < width < 1):
+    if concrete(width) and not (np.ndim(width) == 0 and 0 < float(width) < 1):
         fail("width", f"{width}", "Give a fraction of the limits between 0 and 1, such as 0.02")
     condensed = condense(mpc)
     if scale is not None:

@@ -484,7 +484,7 @@ class MPC:
         if isinstance(gain, Switch):
             given = gain.on
         else:
-            given = gain is not None and concrete(gain) and bool(np.any(gain))
+            given = gain is not None and concrete(gain) and bool(np.any(np.asarray(gain)))
         if given:
             fail("prestabilise", "given beside control_horizon", "Blocked inputs are u, not u − Kx")
         lengths = blocks if isinstance(blocks, tuple) else (blocks,)

@@ -107,7 +107,7 @@ def solve_qp(qp: QP, solver: ADMM = DEFAULT, warm_start: WarmPair = None) -> QPS
     solver.validate(np.shape(qp.A)[0])
     if warm_start is not None:
         require_warm_start(qp, warm_start)
-    linear = concrete(qp.P) and not np.any(qp.P)
+    linear = concrete(qp.P) and not np.any(np.asarray(qp.P))
     arguments = as_arrays(qp), *arrays((solver, warm_start))
     hard = linear or not has_dual_steps(qp.balls, qp.A)
     return in_two_parts(partial(_solve, linear=linear), hard, solver, *arguments)

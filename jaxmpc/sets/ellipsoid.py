@@ -70,7 +70,7 @@ class Ellipsoid(BasicSet):
     def require_origin(self, argument: str) -> None:
         """Raise ValueError, naming `argument`, unless it is centered at the origin."""
         if self.center is not None and not (
-            concrete(self.center) and not np.any(as_array(self.center))
+            concrete(self.center) and not np.any(np.asarray(self.center))
         ):
             cure = "Write the system in deviations from the center, or give a Polytope"
             fail(argument, "is an Ellipsoid with a center", cure)

@@ -82,7 +82,7 @@ def test_plans_are_those_of_the_solver(mpc, states, solved, few):
     same_plans(found, solved)
     assert few[0][1] <= COUNT // 16  # the solved ones first
     infeasible = np.sum(solved.status == jm.Status.PRIMAL_INFEASIBLE)
-    assert few[-1][0] == 1 and few[-1][1] <= infeasible + COUNT // 10
+    assert few[-1][0] == 1 and few[-1][1] <= infeasible + COUNT // 2
     good = np.flatnonzero(found.status == jm.Status.SOLVED)
     for i in good[:: len(good) // 40]:
         plan = jax.tree.map(lambda v, i=i: v[i], found)
@@ -91,11 +91,11 @@ def test_plans_are_those_of_the_solver(mpc, states, solved, few):
 
 @pytest.mark.slow
 def test_most_follow(mpc, states, solved, few):
-    """Of the feasible states few are solved that are not the first of their cell."""
+    """More than half of the feasible states need no solver, in cells of 16 states each."""
     good = states[solved.status == jm.Status.SOLVED]
     many = np.concatenate([good] * 3)[:COUNT]
     jm.solve_many(mpc, many)
-    assert few[-1][0] == 1 and few[-1][1] <= COUNT // 10
+    assert few[-1][0] == 1 and few[-1][1] <= COUNT // 2
 
 
 @pytest.mark.parametrize("tolerance", [1e-3, pytest.param(1e-9, marks=pytest.mark.slow)])

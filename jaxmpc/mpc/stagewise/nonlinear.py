@@ -104,7 +104,7 @@ class Task:
             values = np.asarray(self.weight, float)
             values = np.diag(values) if values.ndim == 1 else np.atleast_2d(values)
             require_symmetric_psd(f"{name}.weight", values)
-        if self.rho is not None and concrete(self.rho) and not self.rho >= 0:
+        if self.rho is not None and concrete(self.rho) and not float(self.rho) >= 0:
             fail(f"{name}.rho", f"{self.rho}", "Give at least 0, or None for hard limits")
         if self.limited and concrete(self.lower, self.upper):
             lower = -np.inf if self.lower is None else np.asarray(self.lower, float)
