@@ -60,7 +60,8 @@ def span(G: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     its columns and N (n, n - r) of their complement, orthonormal both."""
     size = reach(G)
     unit = np.where(size > 0, size, 1.0)
-    U, values, _ = np.linalg.svd(G / unit[:, None], full_matrices=G.shape[1] < len(G))
+    # Of the triangular factor: of thousands of columns themselves it rounds a thousand times more.
+    U, values, _ = np.linalg.svd(np.linalg.qr(G.T / unit, mode="r").T)
     rank = int((values > THIN * max(values, default=1.0)).sum())
     if rank == len(G):
         U = np.eye(rank)

@@ -87,7 +87,7 @@ def hull(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     size = np.where(size > 8 * np.finfo(float).eps * np.abs(points).max(axis=0), size, 0.0)
     scale = np.where(size > 0, size, 1.0)
     scaled = np.where(size > 0, (points - center) / scale, 0.0)
-    _, widths, Vt = np.linalg.svd(scaled, full_matrices=len(points) < n)
+    _, widths, Vt = np.linalg.svd(np.linalg.qr(scaled, mode="r"))
     rank = int((widths > FLAT * max(widths.max(initial=0.0), 1e-300)).sum())
     if rank == n:
         normals, offsets = _full_hull(scaled)
