@@ -82,7 +82,7 @@ def test_plans_are_those_of_the_solver(mpc, states, solved, few):
     same_plans(found, solved)
     assert few[0][1] <= COUNT // 16  # the solved ones first
     infeasible = np.sum(solved.status == jm.Status.PRIMAL_INFEASIBLE)
-    assert few[-1][0] == 1 and few[-1][1] <= infeasible + COUNT // 2
+    assert few[-1][0] == 1 and few[-1][1] <= infeasible + COUNT // 3
     good = np.flatnonzero(found.status == jm.Status.SOLVED)
     for i in good[:: len(good) // 40]:
         plan = jax.tree.map(lambda v, i=i: v[i], found)
