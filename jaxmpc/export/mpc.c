@@ -93,11 +93,16 @@ static int failed(int status, NAME_memory *memory, real *input, NAME_info *info)
   return status;
 }
 
+/* out = E C z, scaled rows */
+static void scaled_rows(const real *z, real *out) {
+  product(M, NZ, C, z, 0, out);
+  for (int i = 0; i < M; i++) out[i] *= E[i];
+}
+
 /* b = E C ZQ q, and ZQ q in move, for the penalties of a stage. */
 static void offset(int stage, const real *q, real *move, real *b) {
   product(NZ, NZ, ZQ + stage * NZ * NZ, q, 0, move);
-  product(M, NZ, C, move, 0, b);
-  for (int i = 0; i < M; i++) b[i] *= E[i];
+  scaled_rows(move, b);
 }
 
 /* What a step of ADMM adds to t, over ALPHA. */
@@ -108,8 +113,7 @@ static void direction(int stage, const real *t, const real *l, const real *u, co
 #if NAME_THIN
   real spare[NZ];
   product(NZ, M, ZF + stage * NZ * M, r, 0, spare);
-  product(M, NZ, C, spare, 0, d);
-  for (int i = 0; i < M; i++) d[i] *= E[i];
+  scaled_rows(spare, d);
 #else
   product(M, M, G + stage * M * M, r, 0, d);
 #endif
@@ -145,11 +149,11 @@ static void warm_start(const NAME_memory *memory, const real *l, const real *u, 
       }
       z[k * MU + i] = value;
     }
-  product(M, NZ, C, z, 0, t);
+  scaled_rows(z, t);
   for (int i = 0; i < M; i++) {
     real later = later_row[i] < 0 ? 0 : memory->y[later_row[i]];
     y[i] = E[i] > 0 ? later / E[i] / rho[i] : 0;
-    t[i] = E[i] * t[i] + y[i];
+    t[i] += y[i];
   }
   project(t, l, u, rho, s);
   for (int i = 0; i < M; i++) t[i] = s[i] + y[i];
@@ -187,8 +191,7 @@ int NAME_step(NAME_memory *memory, const real x[N], const real *state_reference,
     memset(z, 0, sizeof z);
     if (state_reference) product(NZ, N, z_state, state_reference, 1, z);
     if (input_reference) product(NZ, MU, z_input, input_reference, 1, z);
-    product(M, NZ, C, z, 0, t);
-    for (int i = 0; i < M; i++) t[i] *= E[i];
+    scaled_rows(z, t);
   }
   if (memory->warm) {
     /* From the last plan only where it is nearer than nothing: where the first step is shorter. */
