@@ -61,7 +61,7 @@ def span(G: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     size = reach(G)
     unit = np.where(size > 0, size, 1.0)
     # Of the triangular factor: of thousands of columns themselves it rounds a thousand times more.
-    U, values, _ = np.linalg.svd(np.linalg.qr(G.T / unit, mode="r").T)
+    U, values, _ = np.linalg.svd(np.transpose(np.linalg.qr(G.T / unit, mode="r")))
     rank = int((values > THIN * max(values, default=1.0)).sum())
     if rank == len(G):
         U = np.eye(rank)
