@@ -213,8 +213,10 @@ class RowPrograms:
     def __init__(self, rows: ConstraintRows) -> None:
         self.rows, k = rows, sum(rows.balls)
         self.normals = np.concatenate([np.eye(k), -np.eye(k)])
-        # Equalities that the variables can keep, whatever θ is: they leave no margin.
+        # Equalities that the variables can keep, whatever θ is: they leave no margin. A ball does,
+        # though both bounds of its rows are its centre.
         equal = (rows.lower == rows.upper) & (np.linalg.norm(rows.U, axis=1) > 0)
+        equal[len(equal) - k :] = False
         both = np.hstack([rows.U, rows.D])
         both = both * scaling(both[equal], np.zeros(equal.sum()))[1]
         both = both / np.maximum(np.linalg.norm(both, axis=1), 1e-300)[:, None]

@@ -8,6 +8,9 @@ import problems
 import pytest
 
 import jaxmpc as jm
+from jaxmpc.feasible.candidate_search import inputs_of
+from jaxmpc.feasible.problem import FeasibilityProblem
+from jaxmpc.feasible.rays import Rays
 
 
 @pytest.fixture(scope="module")
@@ -50,3 +53,18 @@ class TestBoundaryArguments:
         found = jm.feasible.boundary(mpc, np.array([[1.0, 0.0], [0.0, 1.0]]), center=np.zeros(2))
         assert found.outer[0] == np.inf
         assert found.inner[1] == pytest.approx(1.0, abs=1e-9)
+
+
+def test_centre_keeps_a_margin_in_the_terminal_ellipsoid():
+    """The bounds of a ball's rows, both its centre, are no equality that leaves no margin: of pairs
+    without one not every end is proved. Ends against 2 (ball ⊕ box) by hand."""
+    mpc = jm.MPC(
+        system=jm.LinearSystem(np.eye(2) / 2, np.eye(2)), Q=np.eye(2), R=np.eye(2), horizon=1,
+        inputs=jm.Box(np.full(2, -0.1), np.full(2, 0.1)), terminal_set=jm.Ellipsoid(np.eye(2), 1.0),
+    )  # fmt: skip
+    rays = Rays.of(FeasibilityProblem.of(mpc))
+    inputs, _ = inputs_of(rays.exact, rays.problem.rows, rays.center, rays.w)
+    assert np.linalg.norm(rays.center / 2 + np.asarray(inputs[0])) < 0.99
+    found = jm.feasible.boundary(mpc, 12)
+    beyond_box = np.maximum(np.abs(found.points) / 2 - 0.1, 0.0)
+    np.testing.assert_allclose(np.linalg.norm(beyond_box, axis=1), 1.0, atol=1e-8)
