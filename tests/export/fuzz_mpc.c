@@ -65,7 +65,7 @@ static int is_solved(const law_memory *m, const real *xr, const real *ur) {
 
 int main(int count, char **arguments) {
   long calls = count > 1 ? atol(arguments[1]) : 1000, statuses[6] = {0};
-  long not_finite = 0, beyond = 0, strange = 0, lies = 0, worse = 0, compared = 0;
+  long not_finite = 0, beyond = 0, strange = 0, lies = 0, worse = 0, better = 0, compared = 0;
   law_memory memory, cold;
   real x[N], xr[N], ur[MU], u[MU];
   law_info info;
@@ -108,12 +108,14 @@ int main(int count, char **arguments) {
     if (status == law_SOLVED) lies += !is_solved(&memory, a, b);
     if (after_bad) {
       compared++;
-      if (status != law_SOLVED) worse += law_step(&cold, x, a, b, u, NULL) == law_SOLVED;
+      int cold_solved = law_step(&cold, x, a, b, u, NULL) == law_SOLVED;
+      worse += cold_solved && status != law_SOLVED;
+      better += status == law_SOLVED && !cold_solved;
     }
   }
   printf("not finite %ld\nbeyond limits %ld\nstrange status %ld\nnot solved %ld\n", not_finite, beyond,
          strange, lies);
-  printf("worse than cold %ld\ncompared %ld\nstatuses %ld %ld %ld %ld\n", worse, compared, statuses[1],
-         statuses[2], statuses[3], statuses[4]);
+  printf("worse than cold %ld\nbetter %ld\ncompared %ld\n", worse, better, compared);
+  printf("statuses %ld %ld %ld %ld\n", statuses[1], statuses[2], statuses[3], statuses[4]);
   return 0;
 }

