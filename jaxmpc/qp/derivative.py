@@ -27,7 +27,6 @@ Which element of the generalised derivative is taken, and what it means where no
 """
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -38,7 +37,7 @@ from jaxmpc.qp.admm import Factor, ScaledProgram
 from jaxmpc.qp.dual import KERNEL_ROWS, inverted, sides
 from jaxmpc.qp.jax_transformations import Undo, in_blocks, on_gpu, repeat_while, true_places
 from jaxmpc.qp.kernel import LEAST, Ref, call, gather, indices, load, store
-from jaxmpc.qp.linalg import definite_solver, matmul
+from jaxmpc.qp.linalg import definite_solver, matmul, precisely
 from jaxmpc.qp.newton import Constants, gram, ridged
 from jaxmpc.qp.problem import QP, Bounds
 
@@ -159,32 +158,35 @@ def linearised(
     active rows contradict each other, dw tends to their least-squares solution and dy stays
     bounded by 8ρ times the contradiction.
 
-    flat: whether H is not nearly the identity. Without normals the rows R with D = 0 have dy = ρc,
-    and the others, W, make the system symmetric, Λ = (1/D − 1)/ρ:
+    The rows R with D = 0 have dy = ρc; the others, W, make the system symmetric, Λ = (D⁻¹ − I)/ρ:
 
-        H dw + A_W'dy_W = −a − A_R'dy_R,        A_W dw − Λ dy_W = −c_W/D.
+        H dw + A_W'dy_W = −a − A_R'dy_R,        A_W dw − Λ dy_W = −D⁻¹c_W.
+
+    Of hard and soft rows Λ is diagonal; in the rows of a ball, with D = δI + h h' and |h|² = 1 − δ,
+    it is (δ⁻¹ − 1)/ρ I − g g' with g = h/√(δρ), |multiplier|/radius across the normal and 0 along
+    it. flat: whether H is not nearly the identity.
+
+    The steps are taken in float64 also where the data are float32, whose ρ leaves half of an active
+    set with s = 0.01 undone.
     """
-    D = lambda v: weights * v + sum(h * jnp.sum(h * v) for h in normals)
-    if normals:
-        inverse = definite_solver(dense_system(H, A, weights, normals, rho))
-        return partial(swept, H, A, D, rho, inverse)
     n, active = A.shape[1], weights > jnp.finfo(A.dtype).eps ** 2
-    Lambda = (1 / jnp.where(active, weights, 1.0) - 1) / rho
+    D = jnp.where(active, weights, 1.0)
+    Lambda, turns = (1 / D - 1) / rho, [h / jnp.sqrt(D * rho) for h in normals]
     only = lambda y: jnp.where(active, y, 0.0)
 
     def product(wy: Array) -> Array:
         w, y = wy[:n], wy[n:]
-        rows = jnp.where(active, matmul(w, A.T) - Lambda * y, y)
+        rows = jnp.where(active, matmul(w, A.T) - times(Lambda, turns, y, -1), y)
         return jnp.concatenate([matmul(w, H) + matmul(only(y), A), rows])
 
-    constants, own = jax.lax.stop_gradient(((H, A, flat), (weights, active, Lambda)))
+    constants, own = jax.lax.stop_gradient(((H, A, flat), (active, Lambda, turns)))
 
     def approach(_: Callable, b: Array) -> Array:
-        return jnp.concatenate(approximate(rho, constants, own, (b[:n], b[n:])))
+        return jnp.concatenate(precisely(approximate, constants, own, (b[:n], b[n:])))
 
     def solver(a: Array, c: Array) -> tuple[Array, Array]:
         rest = jnp.where(active, 0.0, rho * c)
-        b = [-a - matmul(rest, A), only(-c / jnp.where(active, weights, 1.0))]
+        b = [-a - matmul(rest, A), only(-c - rho * times(Lambda, turns, c, -1))]
         # In one vector: a part without tangents could not be transposed.
         moved = jax.lax.custom_linear_solve(product, jnp.concatenate(b), approach, symmetric=True)
         return moved[:n], moved[n:] + rest
@@ -192,46 +194,29 @@ def linearised(
     return solver
 
 
-def dense_system(H: Array, A: Array, weights: Array, normals: list[Array], rho: float) -> Array:
-    """Return K = H + ρ A'DA (n, n) of `linearised`, with a ridge."""
-    return ridged(H + rho * gram(A, weights, normals), rho)
+def times(weights: Array, normals: list[Array], y: Array, sign: int = 1) -> Array:
+    """Return (diag(weights) + sign Σ h h') y."""
+    return weights * y + sign * sum(h * jnp.sum(h * y) for h in normals)
 
 
-def swept(
-    H: Array, A: Array, D: Callable, rho: float, inverse: Callable, a: Array, c: Array
-) -> tuple[Array, Array]:
-    """Return (dw, dy) of `linearised` by eight steps of the method of multipliers; inverse: K⁻¹."""
-
-    def sweep(carry: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
-        dw, dy = carry
-        rows = D(matmul(dw, A.T) + dy / rho) + c - dy / rho
-        gradient = a + matmul(dw, H) + matmul(dy, A)
-        step = -inverse(gradient + rho * matmul(rows, A))
-        return (dw + step, dy + rho * (D(matmul(step, A.T)) + rows)), None
-
-    return jax.lax.scan(sweep, (jnp.zeros_like(a), jnp.zeros_like(c)), length=SWEEPS)[0]
-
-
-def approximate(
-    rho: float, constants: tuple, own: tuple, b: tuple[Array, Array]
-) -> tuple[Array, Array]:
+def approximate(constants: tuple, own: tuple, b: tuple[Array, Array]) -> tuple[Array, Array]:
     """Return (dw, dy) of the symmetric system in `linearised` with right-hand sides b; not
-    differentiable. constants: H, A, flat; own: weights, active, Λ.
+    differentiable. constants: H, A, flat; own: active, Λ as its diagonal and the g of balls.
 
     Where H is nearly the identity and few rows are active, the eight steps are taken in these rows
     (`damped`), four of them on what the first four leave of the system, in which H is what it is.
     The other instances of a batch take them with systems of the size of H.
     """
-    (H, A, flat), (weights, active, Lambda) = constants, own
-    if min(A.shape) <= REDUCED_ROWS and not on_gpu():
-        return in_blocks(partial(dense_steps, rho), (H, A), (weights, b))
+    (H, A, flat), (active, Lambda, turns) = constants, own
+    if turns or (min(A.shape) <= REDUCED_ROWS and not on_gpu()):
+        return in_blocks(dense_steps, (H, A), (own, b), large=DENSE_BLOCK)
     most = KERNEL_ROWS if on_gpu() else REDUCED_ROWS
     W, S = true_places(active, most), matmul(A, A.T)
     take = lambda v: v.at[W].get(mode="fill", fill_value=0.0)
 
     def half(b: tuple[Array, Array]) -> tuple[Array, Array]:
         right = take(matmul(b[0], A.T) - b[1])
-        y = damped(S, W, take(Lambda), right, 1 / rho, SWEEPS // 2)
+        y = damped(S, W, take(Lambda), right, 1 / Constants.of(H.dtype).linear, SWEEPS // 2)
         dy = jnp.zeros_like(b[1]).at[W].add(y, mode="drop")
         return b[0] - matmul(dy, A), dy
 
@@ -241,23 +226,34 @@ def approximate(
     reduced = dw + more_w, jnp.where(active, dy + more_y, b[1])
 
     def by_blocks(constants: tuple, state: tuple) -> tuple:
-        weights, b, _, is_open = state
-        found = in_blocks(partial(dense_steps, rho), constants, (weights, b), large=DENSE_BLOCK)
+        own, b, _, is_open = state
+        found = in_blocks(dense_steps, constants, (own, b), large=DENSE_BLOCK)
         # What stayed the same XLA would take for constant, and factor before the loop, for nothing.
-        none = jax.tree.map(jnp.zeros_like, (weights, b))
+        none = jax.tree.map(jnp.zeros_like, (own, b))
         return *none, found, ~is_open
 
     many = (jnp.sum(active) > most) | flat
-    state = weights, b, reduced, many
+    state = own, b, reduced, many
     return repeat_while(lambda s: s[3], by_blocks, (H, A), state, steps="long")[2]
 
 
-def dense_steps(rho: float, constants: tuple, data: tuple) -> tuple[Array, Array]:
-    """Return `approximate` of one instance with any number of active rows, by systems of the size
-    of H. constants: H, A; data: weights, and b, which has no entries in inactive rows."""
-    (H, A), (weights, (a, c)) = constants, data
-    inverse = definite_solver(dense_system(H, A, weights, [], rho))
-    return swept(H, A, lambda v: weights * v, rho, inverse, -a, -weights * c)
+def dense_steps(constants: tuple, data: tuple) -> tuple[Array, Array]:
+    """Return `approximate` of one instance with any number of active rows, by eight steps of the
+    method of multipliers, whose D is that of `linearised` at its own ρ. constants: H, A."""
+    (H, A), ((active, Lambda, turns), (a, c)) = constants, data
+    rho = Constants.of(H.dtype).linear
+    weights = jnp.where(active, 1 / (1 + rho * Lambda), 0.0)
+    normals = [jnp.sqrt(rho * weights) * g for g in turns]
+    inverse = definite_solver(ridged(H + rho * gram(A, weights, normals), rho))
+
+    def sweep(carry: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
+        dw, dy = carry
+        left = matmul(dw, A.T) - times(Lambda, turns, dy, -1) - c
+        rows = times(weights, normals, left)
+        step = inverse(a - matmul(dw, H) - matmul(dy + rho * rows, A))
+        return (dw + step, dy + rho * (times(weights, normals, matmul(step, A.T)) + rows)), None
+
+    return jax.lax.scan(sweep, (jnp.zeros_like(a), jnp.zeros_like(c)), length=SWEEPS)[0]
 
 
 def damped(S: Array, W: Array, Lambda: Array, b: Array, damping: float, steps: int) -> Array:

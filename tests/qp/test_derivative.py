@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.optimize
 from jax import enable_x64
 
 import jaxmpc as jm
@@ -761,6 +762,44 @@ class TestKinks:
         found = derivative(*map(np.float32, (t, a, b, z, y)))
         expected = np.eye(3) - a[:, :, None] * a[:, None, :]
         np.testing.assert_allclose(found, expected, atol=1e-5)
+
+    def test_active_sets_in_bad_condition_in_float32(self):
+        """Rows a, b at an angle of 0.01 that hold z at a vertex, dz/du = (a, b)⁻ᵀ; and the distance
+        from p to an ellipse |Sz| ≤ 1 with half axes 1 and 1/300, z = M⁻¹p with M = I + λS²,
+        dz/dp = M⁻¹ − nn'/n'Mn with n = M⁻¹S²z. In float32 alone both were wrong by a half."""
+        angle = np.float32(0.01)
+        rows = np.array([[1.0, 0.0], [np.cos(angle), np.sin(angle)]], np.float32)
+        one, eye = np.ones(2, np.float32), np.eye(2, dtype=np.float32)
+
+        @jax.jit
+        @jax.jacfwd
+        def vertex(u):
+            beyond = jnp.asarray(rows.T @ one)
+            return outputs(jm.QP(eye, -beyond, rows, -INF * one, u), jm.ADMM())[0][0]
+
+        z = np.linalg.solve(rows.astype(float), one)
+        moved = vertex(np.float32(rows @ z * 0.5))
+        inverse = np.linalg.inv(rows.astype(float))
+        np.testing.assert_allclose(moved, inverse, atol=1e-3 * np.abs(inverse).max())
+
+        S = np.diag([1.0, 300.0])
+
+        @jax.jit
+        @jax.vmap
+        @jax.jacfwd
+        def ellipse(p):
+            ball = {"radius": one[:1], "balls": (2,)}
+            qp = jm.QP(eye, -p, S.astype(np.float32), 0 * one, 0 * one, **ball)
+            return outputs(qp, jm.ADMM())[0][0]
+
+        for p, found in zip(points := np.array([[1.5, 0.3], [0.5, 0.1], [-2, 1]]),
+                            ellipse(np.float32(points)), strict=True):  # fmt: skip
+            z = lambda level, p=p: p / (1 + level * np.diag(S) ** 2)
+            size = lambda level, z=z: np.linalg.norm(S @ z(level)) - 1
+            M = np.eye(2) + scipy.optimize.brentq(size, 0.0, 1e3, xtol=1e-15) * S**2
+            n = np.linalg.solve(M, S**2 @ np.linalg.solve(M, p))
+            expected = np.linalg.inv(M) - np.outer(n, n) / (n @ M @ n)
+            np.testing.assert_allclose(found, expected, atol=1e-5)
 
     def test_smoothing_of_many_rows(self, x64):
         """Every field of a program away from kinks: μ → 0 gives the exact derivative."""
