@@ -197,6 +197,29 @@ def test_derivative():
     np.testing.assert_allclose(backward, [difference, 0], rtol=1e-6)
 
 
+def test_derivative_in_float32():
+    """Against that of the dense plan in float64, where an input costs 10⁻⁴ and active rows are
+    nearly parallel: by a Riccati recursion in float32 alone it was off by 0.3."""
+    slanted = np.array([[1.0, 1.0], [1.0, 1.02]])
+    mpc = jm.MPC(
+        jm.LinearSystem([[1.0, 0.1], [0.0, 1.0]], [[0.005], [0.1]]), np.diag([1.0, 0.1]),
+        np.array([[1e-4]]), 20, states=symmetric(5.0, 0.5), inputs=symmetric(1.0),
+        terminal_cost=np.diag([10.0, 1.0]),
+        terminal_set=jm.Polytope(np.vstack([slanted, -slanted]), np.full(4, 0.1)),
+    )  # fmt: skip
+    states = np.array([[0.5, 0.2], [1.0, 0.3], [0.3, -0.5], [0.6, 0.5]])
+    exact = lambda v: jnp.asarray(np.asarray(v, np.float32), jnp.float64)
+    jacobian = lambda solve: jax.jit(
+        jax.vmap(jax.jacrev(lambda *of: solve(*of).inputs, argnums=1), (None, 0))
+    )
+    dense, staged = jacobian(jm.solve), jacobian(solve_stagewise)
+    expected = dense(*jax.tree.map(exact, (mpc, states)))
+    with enable_x64(False):
+        found = np.asarray(staged(*jax.tree.map(np.float32, (mpc, states))))
+    scale = np.abs(expected).max(axis=(1, 2, 3), keepdims=True)
+    np.testing.assert_allclose(found / scale, expected / scale, atol=1e-4)
+
+
 def test_stage_weights():
     """Without limits the plan is a least-squares solution, here numpy's; both solvers find it."""
     s, rng = np.array([1.0, 0.5, 2.0, 0.1]), np.random.default_rng(0)

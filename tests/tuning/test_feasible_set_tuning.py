@@ -152,7 +152,7 @@ def test_tuning_grows_the_set_and_the_terminal_set_stays_invariant():
     axes = np.linspace(-1.5, 1.5, 30), np.linspace(-2, 2, 30)  # no state of a split by chance
     grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
     with jax.enable_x64(True):
-        of = lambda Qt: feasible_fraction(terminal_law({"Qt": Qt}), grid, 0.1)
+        of = lambda Qt: float(feasible_fraction(terminal_law({"Qt": Qt}), grid, 0.1))
         before, after = map(of, (MPC.Q, run.values["Qt"]))
     assert after > 1.8 * before > 0
 

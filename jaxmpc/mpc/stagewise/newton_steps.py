@@ -53,7 +53,7 @@ from jaxmpc.mpc.stagewise.stages import (
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.admm import scaled_multipliers
 from jaxmpc.qp.jax_transformations import Undo
-from jaxmpc.qp.linalg import rounding
+from jaxmpc.qp.linalg import precisely, rounding
 from jaxmpc.qp.newton import Constants
 from jaxmpc.qp.problem import Bounds
 from jaxmpc.qp.residuals import Pair
@@ -324,25 +324,48 @@ def stage_conditions(
     """The `conditions_of` that `qp.derivative.implicit` takes for the stages and (E, ρ).
 
     The conditions F(s, u, y) = 0 hold at a solution, hence J d(u, y) = −dF with the matrix J of a
-    Newton step: one Riccati recursion, whatever the number of iterations. Rows that touch with a
-    zero multiplier count as inactive, as in `qp/derivative.py`.
+    Newton step: one Riccati recursion, whatever the number of iterations, in float64 as in
+    `qp/derivative.py`. Rows that touch with a zero multiplier count as inactive.
     """
     E, rho = constants
-    v, *at_solution = Errors.of(s, E, rho, u, y)
-    step = newton_direction(s, E, rho, v)
+    v = Errors.of(s, E, rho, u, y).v
+    flat = lambda inputs, rows: jnp.concatenate([inputs.ravel(), rows])
+    split = lambda d: (d[: u.size].reshape(u.shape), d[u.size :])
 
-    def conditions_at(s: Stages, u: Array, y: Array) -> tuple[Array, Array]:
+    def conditions_at(s: Stages) -> Array:
         _, c, gradient = Errors.of(s, E, rho, u, y)
-        return c, gradient
+        return flat(gradient, c)
 
-    def follow(moved: Any) -> Any:
-        # The step is linear; as a derivative of itself it can be transposed, kernels or not.
-        return jax.jvp(step, tuple(at_solution), tuple(moved))[1]
+    def J(s: Stages, E: Array, rho: Array, v: Array, d: Array) -> Array:
+        du, dy = split(d)
+        at = jnp.zeros_like(du), jnp.zeros_like(dy)
+        found = jax.jvp(partial(conditions, s), at, (du, dy))[1]
+        push, D = scaled_multipliers(E, dy) / rho, s.bounds.scaled(E).curvature(v, rho)[0]
+        return flat(found.gradient, D * (E * found.rows + push) - push)
 
-    def undo(moved: Any) -> tuple[Array, Array]:
+    def inverse(s: Stages, E: Array, rho: Array, v: Array, b: Array) -> Array:
+        step = newton_direction(s, E, rho, v)
+        zero = jnp.zeros_like(y, E.dtype), jnp.zeros_like(u, E.dtype)
+
+        def follow(b: Array) -> Array:
+            gradient, c = split(-b)
+            # The step is linear; as a derivative of itself it can be transposed, kernels or not.
+            return flat(*jax.jvp(step, zero, (c, gradient))[1])
+
         # What the proximal step on y leaves, of relative size ρ/κ, is taken up by a second step.
-        first = follow(moved)
-        left = jax.jvp(partial(conditions_at, s), (u, y), first)[1]
-        return jax.tree.map(jnp.add, first, follow(jax.tree.map(jnp.add, moved, left)))
+        first = follow(b)
+        return first + follow(b - J(s, E, rho, v, first))
 
-    return lambda s: conditions_at(s, u, y), undo
+    def transposed(s: Stages, E: Array, rho: Array, v: Array, b: Array) -> Array:
+        return jax.linear_transpose(partial(inverse, s, E, rho, v), b)(b)[0]
+
+    at = jax.lax.stop_gradient((s, E, rho, v))
+
+    def undo(moved: Array) -> tuple[Array, Array]:
+        # In one vector: a part without tangents could not be transposed.
+        solve = lambda _, b: precisely(inverse, *at, b)
+        solve_transposed = lambda _, b: precisely(transposed, *at, b)
+        along = partial(J, s, E, rho, v)
+        return split(jax.lax.custom_linear_solve(along, -moved, solve, solve_transposed))
+
+    return conditions_at, undo
