@@ -10,7 +10,7 @@ import scipy
 from jaxmpc.arrays import Reals, as_array, host_array, store_floats
 from jaxmpc.checks import concrete, fail, require_finite, require_shape, require_symmetric_psd
 from jaxmpc.pytrees import pytree
-from jaxmpc.qp.linalg import solve
+from jaxmpc.qp.linalg import solve, symmetric
 from jaxmpc.sets.fields import (
     AnyNumber,
     AnyTruth,
@@ -107,6 +107,7 @@ class Ellipsoid(BasicSet):
         d, many = one_or_many("d", d, self.dimension)
         xp, (along, P, level) = numbers(d, self.P, self.level)
         columns = along.T if many else along
+        P = symmetric(P)
         solved = np.linalg.solve(P, columns) if xp is np else solve(P, columns)
         square = xp.sum(along * solved.T, axis=-1) if many else along @ solved
         reach = xp.sqrt(level * square)

@@ -69,3 +69,13 @@ def test_ellipse_boundary():
 def test_ellipsoid_errors(ellipsoid, message):
     with pytest.raises(ValueError, match=message):
         ellipsoid.validate("X_f", 2)
+
+
+def test_support_of_a_traced_matrix_that_is_not_symmetric():
+    """x'Px knows the symmetric part of P alone: the largest d'x over points on the boundary."""
+    P, d = np.array([[1.0, 0.8], [0.0, 0.5]]), np.array([1.0, 0.3])
+    angles = np.linspace(0, 2 * np.pi, 100_000)
+    points = np.array([np.cos(angles), np.sin(angles)])
+    points = points / np.sqrt(np.sum(points * (P @ points), axis=0))
+    found = jax.jit(lambda P: Ellipsoid(P, 1.0).support(d))(P)
+    assert found == pytest.approx((d @ points).max(), rel=1e-5)
