@@ -436,7 +436,8 @@ def repeat_while(
     as for 1,024. work: about how many operations a step of one instance has, where that is more
     than its launches take. Not differentiable.
     """
-    one = lambda constants, state: lax.while_loop(is_open, lambda s: step(constants, s), state)
+    advance = lambda constants, state: varying(step(constants, state), state)
+    one = lambda constants, state: lax.while_loop(is_open, partial(advance, constants), state)
     single, state = custom_vmap(one), varying(state, (constants, state))
 
     @single.def_vmap

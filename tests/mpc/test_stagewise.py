@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import enable_x64
+from jax.sharding import AxisType, PartitionSpec
 from problems import lecture, residuals, rows_of, symmetric
 
 import jaxmpc as jm
@@ -413,3 +414,15 @@ def test_wrong_arguments_are_told_before_the_factorization(monkeypatch, given, m
     monkeypatch.setattr("jaxmpc.mpc.stagewise.solve._factor", None)
     with pytest.raises(ValueError, match=message):
         jm.mpc.solve_stagewise(lecture(), **given)
+
+
+@pytest.mark.parametrize("limits", [{}, {"inputs": jm.Box(-1, 1)}])
+@pytest.mark.parametrize("fixed", [False, True])
+def test_plans_in_a_shard_map(limits, fixed):
+    """Zeros that stand for rows of states, or for all rows, vary over the mesh as results do."""
+    system = jm.LinearSystem([[1, 0.1], [0, 1]], [0.005, 0.1])
+    mpc = jm.MPC(system, [1.0, 0.5], 0.1, horizon=3, **limits)
+    mesh, spec = jax.make_mesh((1,), ("b",), axis_types=(AxisType.Auto,)), PartitionSpec("b")
+    plans = jax.vmap(lambda x: solve_stagewise(mpc, x, solver=jm.ADMM(fixed=fixed)).inputs)
+    shared = jax.shard_map(plans, mesh=mesh, in_specs=spec, out_specs=spec)
+    assert jax.eval_shape(shared, jnp.ones((4, 2))).shape == (4, 3, 1)

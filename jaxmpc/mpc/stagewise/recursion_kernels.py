@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxmpc.qp.jax_transformations import on_gpu, with_derivative_of
+from jaxmpc.qp.jax_transformations import on_gpu, varying, with_derivative_of
 from jaxmpc.qp.kernel import EXACT, barrier, call, dot, indices, load, padded_side, program, store
 from jaxmpc.qp.linalg import WAITS, batched, inverse_root_side_by_side, matmul, solve
 
@@ -115,6 +115,7 @@ def _scan(M: Array, w: Array, start: Array, *, adjoint: bool = False, unroll: in
         return y, y
 
     xs = (None if M.ndim == 2 else M, w)
+    start = varying(start, (M, w))
     return jax.lax.scan(stage, start, xs, reverse=adjoint, unroll=unroll)[1]
 
 

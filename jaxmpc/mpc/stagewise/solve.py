@@ -374,7 +374,9 @@ def searched(
 
 def _always(step: Callable, most: int, constants: tuple, state: Any) -> Any:
     """Take `most` steps."""
-    return jax.lax.scan(lambda state, _: (step(constants, state), None), state, length=most)[0]
+    state = varying(state, (constants, state))
+    moved = lambda state, _: (varying(step(constants, state), state), None)
+    return jax.lax.scan(moved, state, length=most)[0]
 
 
 def _while_open(step: Callable, most: int, constants: tuple, state: Any) -> Any:
