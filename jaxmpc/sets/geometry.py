@@ -31,6 +31,7 @@ _MERGE = "C-1e-12"  # qhull's option: merge facets of the dual that are flat to 
 _HULL_DIMENSIONS = 6  # above, hulls have too many facets and one LP a row is faster
 _MOST_ROWS = 100_000  # an elimination step with more candidate rows raises ValueError
 _DOUBTFUL = 1e-5  # a smaller margin is looked at again, in other units
+_ROUNDED = 4 * np.finfo(float).eps  # slacks up to this, of the terms of their row, are rounding
 
 
 class Flat(ValueError):
@@ -100,11 +101,10 @@ def framed(argument: str, G: np.ndarray, g: np.ndarray) -> Frame:
     if margin <= ROUNDING and program.empty:
         raise Empty(f"{argument}: is empty: no point satisfies all its rows. Loosen its rows")
 
-    def slack_at(x: np.ndarray) -> np.ndarray:
+    def slack_at(x: np.ndarray) -> tuple[np.ndarray, float]:
+        """Return the slacks (rows,), and the least of them relative to the terms of its row."""
         slack, size = g - G @ x, np.abs(g) + np.abs(G) @ np.abs(x)
-        if np.any(slack <= 4 * np.finfo(float).eps * size):
-            flat(0.0)
-        return slack
+        return slack, float(np.min(slack / np.where(size > 0, size, 1.0), initial=1.0))
 
     def flat(margin: float) -> NoReturn:
         raise Flat(
@@ -112,24 +112,36 @@ def framed(argument: str, G: np.ndarray, g: np.ndarray) -> Frame:
             "Check the rows: this needs a set with volume"
         )
 
-    slack = slack_at(center)
+    slack, least = slack_at(center)
+    if least <= _ROUNDED:  # a scaled row, whose margin is this in its own units
+        inside, _ = largest_margin(G, g, np.linalg.norm(G, axis=1), 1.0)
+        center = center if inside is None else inside
+        slack, least = slack_at(center)
+        if least <= _ROUNDED:
+            flat(0.0)
     step, margin, _ = Program(G, slack).margin()
-    center = center + step
-    slack = slack_at(center)
-    if margin <= _DOUBTFUL:
+    moved, left = slack_at(center + step)
+    doubtful = margin <= _DOUBTFUL or left <= _ROUNDED
+    if left > least or not doubtful:
+        center, slack = center + step, moved
+    if doubtful:
         low, high = Program(G, slack).bounds()
         half = (high - low) / 2
         if np.any(half <= 0):
             flat(0.0)
         unit = np.where(np.isfinite(half), half, Program(G, slack).column)
+        # (The margin of `Program` is one of scaled rows, which have units of their own.)
         length = np.linalg.norm(G * unit, axis=1)
-        step, margin, _ = Program(G * unit / length[:, None], slack / length).margin()
-        inside = slack - G @ (unit * step)
+        found, _ = largest_margin(G * unit, slack, length, 1.0)
+        step = np.zeros(len(unit)) if found is None else unit * found
+        inside = slack - G @ step
         margin = float((inside / length).min())
         if margin <= FLAT:
             flat(margin)
-        center = center + unit * step
-        slack = slack_at(center)
+        center = center + step
+        slack, least = slack_at(center)
+        if least <= _ROUNDED:
+            flat(0.0)
     return Frame.about(center, G, slack)
 
 

@@ -165,3 +165,18 @@ def test_facets_of_an_interval_and_of_a_square():
     np.testing.assert_array_equal(hull_facets(np.array([[0.5], [2.0], [-1.0]])), [[2], [1]])
     square = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1], [0, 0]])
     assert {tuple(sorted(f)) for f in hull_facets(square)} == {(0, 1), (1, 2), (2, 3), (0, 3)}
+
+
+@pytest.mark.parametrize("size", [1e-3, 1e-5, 1e-7])
+def test_tiny_terminal_sets_leave_volume(size):
+    """Two steps of a double integrator into a box: A⁻² of the box and the two inputs' segments, a
+    zonotope of area 4 Σ |det| over the pairs of its generators."""
+    back = np.linalg.inv([[1.0, 1.0], [0.0, 1.0]])
+    b = np.array([[0.0], [1.0]])
+    generators = np.hstack([size * back @ back, back @ b, back @ back @ b])
+    area = 4 * sum(abs(np.linalg.det(generators[:, [i, j]])) for j in range(4) for i in range(j))
+    mpc = jm.MPC(
+        jm.LinearSystem(np.linalg.inv(back), b), [1.0, 1.0], 1.0, horizon=2, states=jm.Box(-5, 5),
+        inputs=jm.Box(-1, 1), terminal_set=jm.Box(-size, size),
+    )  # fmt: skip
+    assert jm.feasible_polytope(mpc).volume() == pytest.approx(area, rel=1e-7)
