@@ -13,7 +13,7 @@ of the size of the set.
 import itertools
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any, Self
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -50,10 +50,6 @@ _MOST_VERTICES = 100_000  # corners of a box that are listed
 
 class LinearSet(BasicSet):
     """A set of linear inequalities: Box, Polytope or Zonotope."""
-
-    def spread(self, n: int) -> Self:
-        """Return the set, a Box of two numbers as the box with these bounds of n coordinates."""
-        return self
 
     @abstractmethod
     def half_spaces(self) -> tuple[np.ndarray, np.ndarray]:

@@ -7,7 +7,7 @@ difference, `P & Q` the intersection, `P <= Q` and `P == Q` compare sets to 1e-9
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -151,6 +151,10 @@ class BasicSet(ConvexSet):
         found = np.linalg.norm(host_array("x", x) - self.closest_point(x), axis=-1)
         return found if found.ndim else float(found)
 
+    def spread(self, n: int) -> Self:
+        """Return the set, a Box of two numbers as the box with these bounds of n coordinates."""
+        return self
+
     def is_subset(self, other: "BasicSet", tolerance: float = 1e-9) -> bool:
         """Return whether no point of the set violates a limit of another set by more than
         `tolerance`, relative to the limit's own terms.
@@ -163,6 +167,7 @@ class BasicSet(ConvexSet):
         """
         if not isinstance(other, BasicSet):
             fail("other", f"{type(other).__name__} is no set", "Give a Box, Polytope, Zonotope, …")
+        self, other = self.spread(other.dimension), other.spread(self.dimension)
         self._require_fields(type(self).__name__)
         other._require_fields("other", self.dimension)
         if self.is_empty():

@@ -86,3 +86,10 @@ def test_numbers_are_the_limits_of_every_coordinate():
     full = maximal_control_invariant_set(system, Box([-1, -1], [1, 1]), Box([-0.5], [0.5]))
     np.testing.assert_array_equal(given.H, full.H)
     np.testing.assert_array_equal(given.h, full.h)
+
+
+def test_comparisons_of_boxes_of_two_numbers():
+    """Such a box has any dimension where it is asked about a set, and one by itself."""
+    assert Box(-1, 1) == Box(-1.0, 1.0) and Box(-1, 1) != Box(-1, 2) and Box(-1, 1) in [Box(-1, 1)]
+    assert Box(-1, 1) <= Box([-2, -1], [1, 1]) and not Box(-1, 1) <= Box([-2, 0], [1, 1])
+    assert Box(-1, 1) >= Box([-1, 0], [1, 0])
