@@ -383,6 +383,9 @@ class Store:
     def _create(self, path: Path) -> None:
         """Create the store under a temporary name, then rename it to `path`, unless another process
         was first."""
+        if path.is_symlink():
+            what = f"is a link to {path.readlink()}, where nothing is"
+            fail(str(path), what, "Remove the link, or bring back what it leads to")
         partial = side_path(path)
         self._make(partial)
         try:

@@ -99,6 +99,9 @@ def test_a_linked_store_is_not_deleted(folder, tmp_path, capsys):
     with pytest.raises(ValueError, match="is a link to"):
         store.remove(folder / "sweep.zarr")
     assert cli.main([*LINE, str(folder), "--resume"]) == 0
+    shutil.rmtree(tmp_path / "scratch.zarr")
+    assert cli.main([*LINE, str(folder), "--overwrite"]) == 2
+    assert "is a link to" in capsys.readouterr().err
 
 
 def test_resume_with_other_options_deletes_nothing(folder):
