@@ -160,9 +160,12 @@ class Forces:
         """Return the rest at q under a drive; f (nv,), the forces without any."""
         size, missing = 1 + float(np.abs(f).max()), self.at(q, drive)
         if self.couplings.there and np.all(np.abs(missing) <= BALANCED * size):
-            q, drive = self.settled(q, drive)
-            self.at(q, drive)
-            missing = self.data.qfrc_smooth + self.data.qfrc_constraint
+            # Where couplings are too soft for Newton's method, the configuration stays as given.
+            for place in ((q, drive), self.settled(q, drive)):
+                self.at(*place)
+                left = self.data.qfrc_smooth + self.data.qfrc_constraint
+                if place[0] is q or np.all(np.abs(left) <= BALANCED * size):
+                    (q, drive), missing = place, left
         return Rest(q, *self.parts(drive), drive, self.lower, self.upper, missing, size)
 
 

@@ -9,6 +9,7 @@ from c_engine import c_transition
 import jaxmpc as jm
 from jaxmpc.closed_loop.variations import draw_robots
 from jaxmpc.robots.couplings import Couplings
+from jaxmpc.robots.equilibria import rest_at
 
 pytestmark = pytest.mark.usefixtures("uncompared")
 
@@ -143,6 +144,28 @@ def test_a_mimic_joint_of_a_urdf_gets_no_motor(tmp_path):
     np.testing.assert_allclose(states[:, 0], states[:, 1], atol=1e-12)
     model = robot.linearize(robot.home, np.zeros(1))
     np.testing.assert_allclose(model.B[3, 0], model.B[2, 0], rtol=0.15)
+
+
+@pytest.mark.parametrize("other, kind", [("nobody", "prismatic"), ("m", "prismatic"),
+                                         ("l", "fixed")])  # fmt: skip
+def test_what_mimics_nothing_that_moves_is_refused(tmp_path, other, kind):
+    """MuJoCo would leave that finger free, with a line on stderr."""
+    parts = [LIMB.format(name) for name in "pab"]
+    parts += [FINGER.format("l", "a", "").replace("prismatic", kind)]
+    parts += [FINGER.format("m", "b", f'<mimic joint="{other}"/>')]
+    path = tmp_path / "gripper.urdf"
+    path.write_text(f'<robot name="g">{"".join(parts)}</robot>')
+    with pytest.raises(ValueError, match=f"joint m mimics {other}, which is no other joint that"):
+        jm.load_robot(path)
+
+
+def test_a_rest_that_soft_couplings_do_not_reach_stays_where_it_was_asked_for():
+    soft = COUPLINGS["joint"].replace("/>", ' solref=".5 1" solimp=".1 .2 .1"/>')
+    text = MODEL.format(link=LINK, equality=soft)
+    robot = jm.load_robot(mujoco.MjModel.from_xml_string(text))
+    np.testing.assert_array_equal(rest_at(robot, np.zeros(3)).q, 0)
+    with pytest.raises(ValueError, match=r"q: \[0. 0. 0.\]: no input balances the forces"):
+        robot.equilibrium()
 
 
 def test_couplings_that_are_off_couple_nothing():
