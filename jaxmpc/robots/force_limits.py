@@ -26,7 +26,7 @@ import numpy as np
 from jaxmpc.mpc.problem import Outputs
 from jaxmpc.pytrees import pytree
 from jaxmpc.robots.description import RobotDescription, host_coordinates
-from jaxmpc.robots.mujoco_access import SLIDE, mujoco, name_of, single_joints
+from jaxmpc.robots.mujoco_access import SLIDE, moment_arms, mujoco, name_of, single_joints
 from jaxmpc.sets.convex_sets import Box
 
 # Step of central differences in ξ and u: of an affine function any step gives the derivative.
@@ -118,13 +118,16 @@ def stopping_limits(robot: RobotDescription, q: Any, positions: Box) -> Outputs 
     data.qpos[:] = q
     mujoco.mj_forward(smooth, data)
     rest, moved = data.qfrc_passive - data.qfrc_bias, np.zeros(smooth.nv)
-    moment = np.zeros((smooth.nu, smooth.nv))
-    mujoco.mju_sparse2dense(
-        moment, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind
-    )
+    moment = moment_arms(smooth, data)
     ends = np.where(
         model.actuator_forcelimited[:, None], model.actuator_forcerange, [-np.inf, np.inf]
     )
+    on_tendon = _of_tendons(smooth).astype(bool)
+    for tendon in np.flatnonzero(model.tendon_actfrclimited & on_tendon.any(axis=1)):
+        pulls = on_tendon[tendon]
+        share = model.tendon_actfrcrange[tendon] / pulls.sum()
+        ends[pulls, 0] = np.maximum(ends[pulls, 0], share[0])
+        ends[pulls, 1] = np.minimum(ends[pulls, 1], share[1])
     lower, upper = positions.bounds()
     rows = list[tuple[np.ndarray, float, str]]()
     for joint in np.flatnonzero(single_joints(model)):

@@ -79,6 +79,14 @@ def single_joints(model: "mujoco.MjModel") -> np.ndarray:
     return np.isin(model.jnt_type, (SLIDE, HINGE))
 
 
+def moment_arms(model: "mujoco.MjModel", data: "mujoco.MjData") -> np.ndarray:
+    """Return the moments (nu, nv) of the actuators at the position in `data`."""
+    moment, d = np.zeros((model.nu, model.nv)), data
+    parts = d.actuator_moment, d.moment_rownnz, d.moment_rowadr, d.moment_colind
+    mujoco.mju_sparse2dense(moment, *parts)
+    return moment
+
+
 def model_bytes(model: "mujoco.MjModel") -> np.ndarray:
     """Return the model as MuJoCo stores it."""
     buffer = np.zeros(mujoco.mj_sizeModel(model), np.uint8)

@@ -102,6 +102,20 @@ def test_rows_of_stopping_hold_the_parabola():
             assert np.all(inside <= rows.upper) and not np.all(outside <= rows.upper)
 
 
+def test_stopping_knows_the_limits_of_tendons():
+    """A motor at a fixed tendon of ±3 stops as a servo with that force range does."""
+    motor = '<motor tendon="t" ctrlrange="-50 50"/>'
+    tendon = '<tendon><fixed name="t" actuatorfrcrange="-3 3"><joint joint="j" coef="1"/></fixed>'
+    text = SERVO.replace("</worldbody>", f"</worldbody>{tendon}</tendon>")
+    text = text.replace(SERVO[SERVO.index("<position") : SERVO.index("</actuator>")], motor)
+    found, wanted = (
+        stopping_limits(robot, np.zeros(1), robot.state_limits)
+        for robot in (loaded(text, position=1.0), loaded(SERVO, position=1.0))
+    )
+    np.testing.assert_allclose(found.C, wanted.C, rtol=1e-12)
+    np.testing.assert_allclose(found.upper, wanted.upper, rtol=1e-12)
+
+
 @pytest.mark.slow
 def test_plans_of_a_servo_promise_what_the_plant_keeps():
     """The plant needs v²/2a to stop. Where plans of 0.2 s say that they keep all limits it does,
