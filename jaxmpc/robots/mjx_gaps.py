@@ -81,22 +81,19 @@ def translate(model: "mujoco.MjModel") -> list[str]:
     Newton's method solves the problem of contact forces of the PGS solver, too. MJX takes a switch
     of springs or of dampers as one of all passive forces, and knows no groups of actuators.
 
-    Raises ValueError for actuators with several inputs.
+    Raises ValueError for what neither this nor a model without it can replace: `_require_known`.
     """
     mjx_module()
     from mujoco.mjx._src import types
 
-    several = np.flatnonzero(getattr(model, "actuator_ctrlnum", np.ones(0)) != 1)
-    if len(several):
-        names = ", ".join(name_of(model, "actuator", i) for i in several)
-        cure = "Put motors or position actuators, one input each, in their place"
-        fail("model", f"has actuators with several inputs ({names}), which MJX lacks", cure)
     cleared, options = [], model.opt
     for switch in (mujoco.mjtEnableBit.mjENBL_ENERGY, mujoco.mjtEnableBit.mjENBL_FWDINV):
         if options.enableflags & switch:
             options.enableflags &= ~int(switch)
             cleared.append(f"switch {word(switch)}")
-    strange = ~np.isin(model.sensor_type, [int(kind) for kind in types.SensorType])
+    _require_known(model)
+    known = {int(kind) for kind in types.SensorType} - {int(mujoco.mjtSensor.mjSENS_CONTACT)}
+    strange = ~np.isin(model.sensor_type, list(known))  # of contact sensors MJX knows some
     if np.any(strange):
         cleared.append(f"{np.sum(strange)} sensors of types unknown to MJX")
         model.sensor_type[strange] = int(mujoco.mjtSensor.mjSENS_CLOCK)
@@ -121,12 +118,51 @@ def translate(model: "mujoco.MjModel") -> list[str]:
         model.actuator_gaintype[idle] = int(mujoco.mjtGain.mjGAIN_FIXED)
         model.actuator_biastype[idle] = int(mujoco.mjtBias.mjBIAS_NONE)
         model.actuator_gainprm[idle] = model.actuator_biasprm[idle] = 0
+        active = idle & (model.actuator_actadr >= 0)  # their activations stay what they are
+        model.actuator_dyntype[active] = int(mujoco.mjtDyn.mjDYN_FILTER)
+        model.actuator_dynprm[active, 0] = np.inf  # its time constant
         names = ", ".join(name_of(model, "actuator", i) for i in np.flatnonzero(idle))
         cleared.append(f"forces of {names}, whose groups are switched off in the file")
     without = "" if acts(model, "contact") else _leave_out_contacts(model)
     if without:
         cleared.append(f"contacts of {without}, switched off in the file")
     return cleared + _without_frictionless(model)
+
+
+def _require_known(model: "mujoco.MjModel") -> None:
+    """Raise ValueError, naming them, for actuators with several inputs, for types of actuators and
+    equalities, integrators and switches that MJX does not know, and for deformable bodies."""
+    from mujoco.mjx._src import types
+
+    def refuse(kind: str, rows: np.ndarray, what: str) -> None:
+        if len(rows):
+            cure = "Put motors or position actuators, one input each, in their place"
+            cure = cure if kind == "actuator" else "Take that out of the file"
+            fail("model", f"has {_listed(model, kind, '', rows)}, {what}, which MJX lacks", cure)
+
+    inputs = getattr(model, "actuator_ctrlnum", np.ones(0))
+    refuse("actuator", np.flatnonzero(inputs != 1), "with several inputs")
+    for field, known, kinds in (
+        ("actuator_trntype", types.TrnType, mujoco.mjtTrn),
+        ("actuator_dyntype", types.DynType, mujoco.mjtDyn),
+        ("actuator_gaintype", types.GainType, mujoco.mjtGain),
+        ("actuator_biastype", types.BiasType, mujoco.mjtBias),
+        ("eq_type", types.EqType, mujoco.mjtEq),
+    ):
+        given = getattr(model, field)
+        rows = np.flatnonzero(~np.isin(given, [int(kind) for kind in known]))
+        of_type = "".join(f"of the type {word(kinds(int(given[i])))}" for i in rows[:1])
+        refuse("equality" if field == "eq_type" else "actuator", rows, of_type)
+    refuse("flex", np.arange(model.nflex), "deformable")
+    integrator = mujoco.mjtIntegrator(model.opt.integrator)
+    if word(integrator) not in ("euler", "rk4", "implicitfast"):
+        cure = 'Write integrator="implicitfast"'
+        fail("model", f"has the integrator {word(integrator)}, which MJX lacks", cure)
+    known = sum(types.EnableBit) | mujoco.mjtEnableBit.mjENBL_SLEEP  # of that see `lacks`
+    for bit in range(mujoco.mjtEnableBit.mjNENABLE):
+        if model.opt.enableflags & ~known & 1 << bit:
+            switch = word(mujoco.mjtEnableBit(1 << bit))
+            fail("model", f"has the flag {switch}, which MJX lacks", "Take that out of the file")
 
 
 def lacks(model: "mujoco.MjModel") -> list[Lack]:
@@ -443,7 +479,8 @@ def _moved_by(model: "mujoco.MjModel", i: Any) -> str:
     """Return what entry i of (accelerations, rates of activations) belongs to."""
     if i < model.nv:
         return f"{name_of(model, 'joint', model.dof_jntid[i])} accelerates"
-    k = int(np.flatnonzero(model.actuator_actadr <= i - model.nv)[-1])
+    first = model.actuator_actadr
+    k = int(np.flatnonzero((first >= 0) & (first <= i - model.nv))[-1])
     return f"{name_of(model, 'actuator', k)} activates"
 
 

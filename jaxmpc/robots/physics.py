@@ -57,9 +57,9 @@ class Physics:
                 self.mjx = self.mjx.replace(**_without_margins(self.mjx))
                 blank = mjx.make_data(model, impl="jax")
         except NotImplementedError as error:
-            integrator = "mjINT_IMPLICIT" in str(error)
-            cure = 'Write integrator="implicitfast"' if integrator else "Take that out of the file"
-            fail("model", f"MJX does not support it: {error}", cure)
+            fluid = "fluid" in str(error)
+            cure = 'Write integrator="Euler"' if fluid else "Take that out of the file"
+            fail("model", f"MJX does not support it: {str(error).rstrip('.')}", cure)
         self.constraints = len(blank._impl.efc_J)
         self.rows = self.constraints > 0
         self.tamed = TAMED if self.rows or model.ntendon else {}
