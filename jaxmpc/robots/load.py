@@ -1,5 +1,6 @@
 """load_robot: from an MJCF or URDF file to a Robot, its limits and names read and checked."""
 
+import codecs
 import copy
 import hashlib
 import re
@@ -24,6 +25,7 @@ from jaxmpc.robots.mujoco_access import (
     equalities,
     flag,
     model_bytes,
+    moment_arms,
     mujoco,
     names,
     number_of,
@@ -201,7 +203,7 @@ def _opened(
             host, lost = compiled_mjcf(path, motors)
             return _File(host, path.stem, {}, (), False, lost)
         welded = not floating_base
-        root = parsed_urdf(path.read_text())
+        root = parsed_urdf(path.read_bytes())
         drawn = drawable(root, path.resolve().parent)
         host, velocities, mended = compiled_urdf(root, floating_base, mend_inertias)
         if floating_base:
@@ -388,6 +390,7 @@ def _is_motor(host: "mujoco.MjModel", i: int) -> bool:
     """Return whether an actuator puts a multiple of its input on one hinge or slide joint."""
     return (
         host.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT
+        and host.actuator_dyntype[i] == mujoco.mjtDyn.mjDYN_NONE
         and host.jnt_type[host.actuator_trnid[i, 0]] in (SLIDE, HINGE)
         and host.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_FIXED
         and host.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_NONE
@@ -401,22 +404,26 @@ def input_limits(host: "mujoco.MjModel") -> tuple[Box, list[str]]:
     limited = host.actuator_ctrllimited.astype(bool)
     lower[limited], upper[limited] = host.actuator_ctrlrange[limited].T
     sources = ["ctrlrange" if yes else "" for yes in limited]
-    on_joint = host.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
-    joints = np.where(on_joint, host.actuator_trnid[:, 0], -1)
+    # Which actuators move a joint, also by tendons and sites, shows where nothing is aligned.
+    data, rng = mujoco.MjData(host), np.random.default_rng(0)
+    mujoco.mj_integratePos(host, data.qpos, rng.normal(size=host.nv), 1.0)
+    mujoco.mj_fwdPosition(host, data)
+    counts = np.sum(moment_arms(host, data) != 0, axis=0)
     for i in range(host.nu):
         gain, gear = host.actuator_gainprm[i, 0], host.actuator_gear[i, 0]
         if not _is_motor(host, i) or gain * gear == 0:
             continue
-        alone = np.sum(joints == joints[i]) == 1
+        joint = host.actuator_trnid[i, 0]
+        alone = counts[host.jnt_dofadr[joint]] == 1
         ends = {}
         if host.actuator_forcelimited[i]:
             ends["forcerange"] = host.actuator_forcerange[i] / gain
             host.actuator_forcelimited[i] = 0
         # The limit of a joint bounds what compensates gravity there, too.
-        alone = alone and not host.jnt_actgravcomp[joints[i]]
-        if host.jnt_actfrclimited[joints[i]] and alone:
-            ends["actuatorfrcrange"] = host.jnt_actfrcrange[joints[i]] / (gain * gear)
-            host.jnt_actfrclimited[joints[i]] = 0
+        alone = alone and not host.jnt_actgravcomp[joint]
+        if host.jnt_actfrclimited[joint] and alone:
+            ends["actuatorfrcrange"] = host.jnt_actfrcrange[joint] / (gain * gear)
+            host.jnt_actfrclimited[joint] = 0
         for source, end in ends.items():
             if end.min() > lower[i] or end.max() < upper[i]:
                 sources[i] = source
@@ -495,6 +502,8 @@ def compiled_mjcf(path: Path, motors: bool = False) -> "tuple[mujoco.MjModel, tu
         _add_motors(spec, followers)
     while True:
         try:
+            if path.suffix.lower() == ".mjb":
+                return mujoco.MjModel.from_binary_path(str(path)), ()
             if spec is None:
                 return mujoco.MjModel.from_xml_path(str(path)), ()
             return spec.compile(), tuple(lost)
@@ -502,24 +511,32 @@ def compiled_mjcf(path: Path, motors: bool = False) -> "tuple[mujoco.MjModel, tu
             missing = re.search(r"rror opening file '(.*)'", str(error))
             spec = mujoco.MjSpec.from_file(str(path)) if spec is None else spec
             if missing is None or not (text := _without_file(spec, missing[1])):
-                raise
+                raise ValueError("; ".join([*lost, str(error)])) from error
             lost.append(text)
 
 
 def _without_file(spec: "mujoco.MjSpec", file: str) -> str:
     """Take out of a model what needs a file that is missing; return it in words, "" for nothing."""
-    named = lambda asset: asset.file and Path(file).name == Path(asset.file).name
-    textures = [texture for texture in spec.textures if named(texture)]
+    name = Path(file).name
+    named = lambda asset: bool(asset.file) and name == Path(asset.file).name
+    sides = lambda texture: [Path(side).name for side in texture.cubefiles]
+    textures = [texture for texture in spec.textures if named(texture) or name in sides(texture)]
     for texture in textures:
         texture.file, texture.builtin = "", mujoco.mjtBuiltin.mjBUILTIN_FLAT
+        texture.cubefiles = [""] * len(texture.cubefiles)
         texture.width = texture.height = 1
     if textures:
         return f"the texture {file}, which is missing"
+    if skins := [skin for skin in spec.skins if named(skin)]:
+        for skin in skins:
+            spec.delete(skin)
+        return f"the skin {file}, which is missing"
     meshes = [mesh for mesh in spec.meshes if named(mesh)]
     shapes = [geom for geom in spec.geoms if geom.meshname in {mesh.name for mesh in meshes}]
+    by_shapes = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
     for shape in shapes:
         body = shape.parent
-        if body.name != "world" and not body.explicitinertial:
+        if body.name != "world" and shape.mass != 0 and (by_shapes or not body.explicitinertial):
             problem = f"the mesh {file} is missing, whose shape gives body {body.name} its mass"
             raise ValueError(f"{problem}; put the file there, or give the body an <inertial>")
     for part in (*shapes, *meshes):
@@ -557,19 +574,9 @@ def compiled_urdf(
     if floating_base:
         _free(root)
     changes = _mended(root) if mend_inertias else ()  # the freed root link counts as moving
-    limits = ((joint.get("name"), joint.find("limit")) for joint in root.iter("joint"))
-    velocities = {
-        str(name): float(limit.get("velocity", "inf")) or np.inf
-        for name, limit in limits
-        if limit is not None
-    }
+    velocities, mimics = _velocities(root), _mimics(root)
     try:
         spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
-        mimics = {
-            str(joint.get("name"))
-            for joint in root.iter("joint")
-            if joint.find("mimic") is not None
-        }
         _add_motors(spec, mimics)
         return spec.compile(), velocities, changes
     except ValueError as error:
@@ -581,9 +588,57 @@ def compiled_urdf(
         raise ValueError(problem) from error
 
 
-def parsed_urdf(text: str) -> ElementTree.Element:
-    """Return the root of a URDF. Prefixes of other programs (drake:acceleration) that the file does
-    not declare, as most readers of URDF allow, are declared here."""
+def _velocities(root: ElementTree.Element) -> dict[str, float]:
+    """Return the limits of the velocities of the joints of a URDF, ∞ for 0. Raises ValueError for
+    limits that no motion keeps: MuJoCo would drop such a range in silence."""
+    found = dict[str, float]()
+    for joint in root.iter("joint"):
+        if (limit := joint.find("limit")) is None or joint.get("type") == "fixed":
+            continue
+        name = str(joint.get("name"))
+        try:
+            numbers = [float(limit.get(key, 0)) for key in ("lower", "upper", "effort", "velocity")]
+        except ValueError as error:
+            raise ValueError(f"a limit of joint {name} is no number: {error}") from None
+        lower, upper, effort, velocity = numbers
+        if not (lower < upper or lower == upper == 0 or joint.get("type") == "continuous"):
+            raise ValueError(f"joint {name} has the range [{lower:g}, {upper:g}]")
+        if not (effort >= 0 and velocity >= 0):
+            raise ValueError(f"joint {name} has the effort {effort:g}, the velocity {velocity:g}")
+        found[name] = velocity or np.inf
+    return found
+
+
+def _mimics(root: ElementTree.Element) -> set[str]:
+    """Return the names of the joints of a URDF that mimic another. Raises ValueError where that is
+    none that moves: MuJoCo would leave them free."""
+    moving = {
+        joint.get("name")
+        for joint in root.iter("joint")
+        if joint.get("type") in ("revolute", "continuous", "prismatic")
+    }
+    found = set[str]()
+    for joint in root.iter("joint"):
+        mimic, name = joint.find("mimic"), joint.get("name")
+        if mimic is None or name not in moving:
+            continue
+        if (other := mimic.get("joint")) not in moving - {name}:
+            raise ValueError(f"joint {name} mimics {other}, which is no other joint that moves")
+        found.add(str(name))
+    return found
+
+
+def parsed_urdf(file: bytes) -> ElementTree.Element:
+    """Return the root of a URDF, in the encoding that it declares. Prefixes of other programs
+    (drake:acceleration) that the file does not declare, as most readers of URDF allow, are declared
+    here."""
+    wide = file.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    named = re.match(rb"""[^<]*<\?xml[^>]*encoding\s*=\s*["']([\w.-]+)""", file)
+    try:
+        text = file.decode("utf-16" if wide else named[1].decode() if named else "utf-8-sig")
+    except LookupError as error:
+        raise ValueError(str(error)) from error
+    text = text.removeprefix("\ufeff")
     used = set(re.findall(r"[\s</]([A-Za-z_][\w.-]*):[A-Za-z_]", text))
     declared = set(re.findall(r"xmlns:([\w.-]+)\s*=", text))
     missing = sorted(used - declared - {"xml", "xmlns"})

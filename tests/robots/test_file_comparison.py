@@ -11,6 +11,7 @@ from c_engine import c_transition
 
 import jaxmpc as jm
 from jaxmpc.robots.jaxpr_rewriting import rewritten
+from jaxmpc.robots.mjx_gaps import _moved_by
 from jaxmpc.robots.physics import TAMED
 
 ARM = """
@@ -114,6 +115,31 @@ RIGHT = {
     "solver PGS": {"option": 'solver="PGS"', "joint": 'frictionloss=".2"'},
     "solver CG": {"option": 'solver="CG"', "joint": 'frictionloss=".2"'},
     "actuatorgroupdisable": {"option": 'actuatorgroupdisable="2"', "actuator": IN_GROUP},
+    "group off with an activation": {
+        "option": 'actuatorgroupdisable="2"',
+        "actuator": MOTOR.format("") + GENERAL.format('dyntype="filter" dynprm=".1" group="2"'
+                                                      ).replace('"m"', '"off"'),
+    },
+    "actuatorfrcrange of a motor and a tendon": {
+        "joint": 'damping=".1" actuatorfrcrange="-1 1"', "tendon": FIXED.format(""),
+        "actuator": MOTOR.format("") + '<motor tendon="t" ctrlrange="-3 3"/>',
+    },
+    "actuatorfrcrange of a motor and a site": {
+        "joint": 'damping=".1" actuatorfrcrange="-1 1"',
+        "actuator": MOTOR.format("") + '<motor site="s" gear="0 0 9 0 0 0" ctrlrange="-3 3"/>',
+    },
+    "filter forcerange": {
+        "actuator": GENERAL.format('dyntype="filter" dynprm=".05" forcerange="-1 1"')
+    },
+    "integrator actuatorfrcrange": {
+        "joint": 'damping=".1" actuatorfrcrange="-1 1"',
+        "actuator": GENERAL.format('dyntype="integrator"'),
+    },
+    "contact sensor": {
+        "world": FLOOR.format(""),
+        "actuator": MOTOR.format("") + "</actuator><sensor><contact subtree1='world' data='force'/>"
+        "</sensor><actuator>",
+    },
     "motor gear": {"actuator": MOTOR.format('gear="3"')},
     "motor forcerange": {"actuator": MOTOR.format('forcerange="-2 1"')},
     "position": {"actuator": '<position joint="j" kp="30" kv="2" ctrlrange="-2 2"/>'},
@@ -254,14 +280,19 @@ UNSEEN = ("noslip", "flag sleep")
 REFUSED = {
     "orientation": ({"second": BALL.format(""),
                      "actuator": '<orientation name="m" joint="k" kp="2" kv=".1"/>'},
-                    "has actuators with several inputs .actuator m"),
-    "integrator implicit": ({"option": 'integrator="implicit"'}, "MJX does not support"),
+                    "has actuator m, with several inputs, which MJX lacks"),
+    "integrator implicit": ({"option": 'integrator="implicit"'}, "has the integrator implicit,"),
+    "integrator discrete": ({"option": 'integrator="discrete"'}, "has the integrator discrete,"),
     "slidercrank": ({"actuator": '<motor cranksite="s" slidersite="w" cranklength=".5"/>'},
-                    "MJX does not support"),
-    "flag override": ({"flag": '<flag override="enable"/>'}, "MJX does not support"),
-    "dyntype user": ({"actuator": GENERAL.format('dyntype="user"')}, "MJX does not support"),
-    "adhesion actuator": ({"actuator": '<adhesion body="b" ctrlrange="0 1"/>',
-                           "world": FLOOR.format("")}, "MJX does not support"),
+                    "has actuator 1, of the type slidercrank, which MJX lacks"),
+    "flag override": ({"flag": '<flag override="enable"/>'}, "has the flag override, which MJX"),
+    "dyntype user": ({"actuator": GENERAL.format('dyntype="user"')}, "has actuator m, of the type"),
+    "adhesion actuator": ({"actuator": '<adhesion name="g" body="b" ctrlrange="0 1"/>',
+                           "world": FLOOR.format("")}, "has actuator g, of the type body"),
+    "flex": ({"world": '<flexcomp type="grid" count="3 3 1" spacing=".1 .1 .1" name="f" mass="1" '
+              'dim="2" radius=".01"/>'}, "has flex f, deformable, which MJX lacks"),
+    "a fluid in implicitfast": ({"option": 'integrator="implicitfast" density="9"'},
+                                "MJX does not .* drag. Write integrator=.Euler"),
 }  # fmt: skip
 
 
@@ -424,6 +455,39 @@ def test_shapes_of_missing_meshes_are_left_out(tmp_path):
     path.write_text(SHAPED.format(""))
     with pytest.raises(ValueError, match="link.stl is missing, whose shape gives body arm its ma"):
         jm.load_robot(path)
+
+
+def test_what_a_missing_file_leaves(tmp_path):
+    """Skins and textures leave nothing; what refers to a shape, or weighs what it does, is
+    refused with the name of the file."""
+    path = tmp_path / "shaped.xml"
+    whole = SHAPED.format('<inertial pos=".1 0 0" mass="1" diaginertia=".01 .01 .01"/>')
+    sky = '<texture type="skybox" fileup="sky.png"/><texture name="t"'
+    skin = '</worldbody><deformable><skin file="skin.skn"/></deformable>'
+    path.write_text(whole.replace('<texture name="t"', sky).replace("</worldbody>", skin))
+    with pytest.warns(UserWarning, match="texture sky.png.* skin parts/skin.skn, which is missing"):
+        jm.load_robot(path)
+    sensor = '<sensor><framepos objtype="geom" objname="g"/></sensor></mujoco>'
+    path.write_text(whole.replace("mesh='m'", "").replace('mesh="m" mat', 'name="g" mesh="m" mat')
+                    .replace("</mujoco>", sensor))  # fmt: skip
+    with pytest.raises(ValueError, match="mesh parts/link.stl, which is missing; .* name 'g'"):
+        jm.load_robot(path)
+    path.write_text(whole.replace("<compiler", '<compiler inertiafromgeom="true"'))
+    with pytest.raises(ValueError, match="link.stl is missing, whose shape gives body arm its ma"):
+        jm.load_robot(path)
+
+
+def test_a_compiled_model_in_a_file(tmp_path):
+    model = written({})
+    mujoco.mj_saveModel(model, str(tmp_path / "arm.mjb"), None)
+    robot = jm.load_robot(tmp_path / "arm.mjb")
+    np.testing.assert_array_equal(robot.mujoco.body_mass, model.body_mass)
+
+
+def test_the_actuator_whose_activation_differs_is_named():
+    """Of actuators without activations beside it none is meant."""
+    parts = {"actuator": GENERAL.format('dyntype="filter" dynprm=".1"') + '<motor joint="k"/>'}
+    assert _moved_by(written(parts), 2) == "actuator m activates"
 
 
 SERVO = '<position joint="j" kp="30" kv="2" ctrlrange="-2 2" forcerange="{0} {1}"/>'

@@ -1,5 +1,6 @@
 """What users give: URDFs under other names, quaternions, a slide that leaves the usual view."""
 
+import re
 from pathlib import Path
 
 import mujoco
@@ -42,6 +43,34 @@ def test_what_is_wrong_in_a_urdf_is_named(tmp_path):
     path = Path(tmp_path / "comma.urdf")
     path.write_text(URDF.replace('xyz="0 0 .5"', 'xyz="0, 0 .5"'))
     with pytest.raises(ValueError, match="bad format in attribute 'xyz' Element 'origin'. Mend"):
+        jm.load_robot(path)
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "iso-8859-1", "utf-8-sig"])
+def test_a_urdf_in_the_encoding_that_it_declares(tmp_path, encoding):
+    path = Path(tmp_path / "swing.urdf")
+    declared = URDF.replace('"1.0"?>', f'"1.0" encoding="{encoding.removesuffix("-sig")}"?>')
+    path.write_bytes(declared.replace("in a comment", "größer").encode(encoding))
+    np.testing.assert_array_equal(jm.load_robot(path).input_limits.upper, [5])
+
+
+@pytest.mark.parametrize(
+    "given, words",
+    [
+        ('lower="1" upper="-1"', "joint hinge has the range .1, -1."),
+        ('lower="1" upper="1"', "joint hinge has the range .1, 1."),
+        ('velocity="-2"', "joint hinge has the effort 5, the velocity -2"),
+        ('velocity="2 m"', "a limit of joint hinge is no number: .*'2 m'"),
+    ],
+)
+def test_limits_of_a_urdf_that_no_motion_keeps_are_refused(tmp_path, given, words):
+    """MuJoCo drops an empty range, and the joint would have none."""
+    path = Path(tmp_path / "swing.urdf")
+    names = {part.split("=")[0]: part for part in re.findall(r'\w+="[^"]*"', given)}
+    limit = {"lower": 'lower="-1"', "upper": 'upper="1"', "velocity": 'velocity="2"'} | names
+    text = f'<limit effort="5" {" ".join(limit.values())}/>'
+    path.write_text(re.sub(r"<limit [^>]*>", text, URDF))
+    with pytest.raises(ValueError, match=f"model: .*{words}. Mend the file"):
         jm.load_robot(path)
 
 
