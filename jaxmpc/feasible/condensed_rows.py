@@ -115,8 +115,7 @@ def constraint_rows(
     C = C / row_unit[:, None] * unit
 
     norm = np.linalg.norm(C, axis=1)
-    ends = np.abs([lower, upper])
-    ends = np.where(np.isfinite(ends), ends, 0.0).max(axis=0)
+    ends = size_of_limits(lower, upper)
     # A row counts as zero if its entries are rounding beside its other terms.
     others_of_row = np.linalg.norm(D * scaling(D, ends)[1], axis=1) + ends
     zero = norm * row_unit <= 1e-13 * others_of_row
@@ -160,6 +159,15 @@ def constraint_rows(
         radius=weight[-1:] * c.radius if c.balls else None,
         balls=c.balls,
     )
+
+
+def size_of_limits(lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    """Return the size of the farther bound of each row, 0 where it has none. One that is a million
+    times farther than the other stands for none."""
+    ends = np.abs([lower, upper])
+    ends = np.where(np.isfinite(ends), ends, 0.0)
+    near, far = ends.min(axis=0), ends.max(axis=0)
+    return np.where((near > 0) & (far > 1e6 * near), near, far)
 
 
 def typical_bound(lower: np.ndarray, upper: np.ndarray) -> float:
@@ -382,11 +390,7 @@ class RowPrograms:
         rows = self.rows
         k, d = rows.U.shape[1], rows.D.shape[1]
         both = np.hstack([rows.U, rows.D])
-        ends = np.abs([rows.lower, rows.upper])
-        ends = np.where(np.isfinite(ends), ends, 0.0)
-        near, far = ends.min(axis=0), ends.max(axis=0)
-        # An end a million times farther than the other stands for none.
-        ends = np.where((near > 0) & (far > 1e6 * near), near, far)
+        ends = size_of_limits(rows.lower, rows.upper)
         # Margins in units in which rows and coordinates are about 1.
         size = np.where(self.equalities, 0.0, 1 / scaling(both, ends)[0])
         if rows.balls:

@@ -156,6 +156,15 @@ def test_boxes(kind, missing, none):
     check(planar(kind, none, missing.split()), whole=missing != "-0 +0 -1")
 
 
+def test_rows_that_inputs_move_are_none_of_zeros():
+    """Whatever the other bound of a row is: beside 1e12 its entries, 0.045, are no rounding."""
+    zero = [
+        FeasibilityProblem.of(planar("marginal", none, ("-0",))).rows.zero_rows
+        for none in (np.inf, 1e12)
+    ]
+    np.testing.assert_array_equal(*zero)
+
+
 @pytest.mark.parametrize("none", [1e9, *slow(np.inf, 1e12, 1e20)])
 @pytest.mark.parametrize(
     "settings",
