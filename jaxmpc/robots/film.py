@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxmpc.arrays import Reals
+from jaxmpc.arrays import Reals, host_array
 from jaxmpc.checks import fail, require_finite, require_shape, whole
 from jaxmpc.pytrees import record
 from jaxmpc.robots.description import host_coordinates
@@ -118,19 +118,19 @@ def _checked(
     (F, nq), None where there are none; raise ValueError for wrong arguments of `render`."""
     if not isinstance(robot, Robot):
         fail("robot", f"is a {type(robot).__name__}", "Only a Robot has a shape to draw")
-    states = np.asarray(states, float)
+    states = host_array("states", states)
     if states.ndim not in (2, 3) or states.shape[-1] != robot.state_size or not states.size:
         fail("states", f"shape {states.shape}", f"Give ([robots,] samples, {robot.state_size})")
     require_finite("states", states)
     whole("every", every, 1)
     samples, nq = states.shape[-2], robot.mujoco.nq
     if inputs is not None:
-        inputs = np.asarray(inputs, float)
+        inputs = host_array("inputs", inputs)
         shape = (*states.shape[:-2], samples - 1, robot.m)
         require_shape("inputs", inputs, shape, "Give those between the states")
         inputs = inputs.reshape(-1, *shape[-2:])
     if target is not None:
-        target = np.asarray(target, float)
+        target = host_array("target", target)
         shape = (samples, nq) if target.ndim == 2 else (nq,)
         require_shape("target", target, shape, "Give one qpos, or one for each state")
         require_finite("target", target)

@@ -429,6 +429,7 @@ def test_film_refuses_what_it_cannot_draw(tmp_path, monkeypatch, joint):
     for states, options, message in (
         (np.zeros((3, 3)), {}, "states: shape"),
         (np.full((3, 2), np.nan), {}, "states: holds NaN"),
+        (joint, {}, "states: .* where real numbers are needed"),
         (np.zeros((3, 2)), {"every": 0}, "every: 0"),
         (np.zeros((3, 2)), {"camera": "left"}, "none named 'left'"),
         (np.zeros((3, 2)), {"inputs": np.zeros((3, 1))}, r"inputs: shape \(3, 1\)"),

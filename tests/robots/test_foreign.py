@@ -57,13 +57,17 @@ def test_set_points_balance_or_say_so(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", STEPPED)
 def test_steps_and_their_derivatives_are_the_c_engines(name):
-    """In the air (the set-point, moved a little) and after half a second of falling, in contact
-    where the model has any; steps in both precisions, derivatives in float64."""
+    """In the air (the set-point, moved a little, off the stops of joints, where derivatives have
+    two sides) and after half a second of falling, in contact where the model has any; steps in both
+    precisions, derivatives in float64."""
     robot, x, u, _ = loaded(name)
     model, rng = robot.mujoco, np.random.default_rng(0)
     u = u + 0.01 * rng.normal(size=robot.m)
     fallen = c_steps(model, x, u, round(0.5 / model.opt.timestep))
     x[model.nq : model.nq + model.nv] = 0.1 * rng.normal(size=model.nv)
+    stops = np.flatnonzero(model.jnt_limited)
+    at, ends = model.jnt_qposadr[stops], model.jnt_range[stops].T
+    x[at] = np.clip(x[at], ends[0] + 1e-3, ends[1] - 1e-3)
     with jax.enable_x64(True):
         step, transition = jax.jit(robot.plant.step), robot.transition
         for state in (x, fallen):
