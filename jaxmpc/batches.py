@@ -185,7 +185,8 @@ def chosen_devices(devices: Any, name: str = "devices") -> Devices:
     if devices is None:
         return None
     there = jax.local_devices()
-    if not isinstance(devices, Sequence | np.ndarray) or isinstance(devices, str):
+    several = isinstance(devices, Sequence | np.ndarray) and not isinstance(devices, str)
+    if not several or np.ndim(devices) == 0:
         count = whole(name, devices, 1)
         if count > len(there):
             fail(name, f"{count} where this process has {len(there)}", "Give fewer")

@@ -10,7 +10,7 @@ import math
 import os
 import shutil
 import unicodedata
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Set
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NoReturn
@@ -139,6 +139,15 @@ def whole(argument: str, value: Any, least: int) -> int:
     if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < least:
         fail(argument, f"{value!r}", f"Give a whole number of at least {least}")
     return int(value)
+
+
+def entries(argument: str, values: Any, cure: str) -> list[Any]:
+    """Return the entries of a list, tuple or array; raise for a number, a text, and what has no
+    order."""
+    ordered = isinstance(values, Iterable) and not isinstance(values, str | Mapping | Set)
+    if not ordered or getattr(values, "ndim", 1) == 0:
+        fail(argument, f"{shown(values)} is not a list", cure)
+    return list(values)
 
 
 def shown(value: Any) -> str:

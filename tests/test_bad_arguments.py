@@ -31,6 +31,15 @@ def qp(**changes):
 
 
 M = mpc()
+BOX = M.states
+
+
+def fraction(x0s=((0, 0),), **more):
+    return jm.feasible.feasible_fraction(M, x0s, **more)
+
+
+def sweep(along, **more):
+    return jm.feasible.sweep_into("nowhere", M, along, **more)
 
 
 # How the answer begins, and the call.
@@ -478,7 +487,7 @@ CALLS = [
         lambda: jm.map_feasible_set(M, np.zeros((3, 1)), axes=(5,)),
     ),
     (
-        "axes: ('q',). Give state indices or",
+        "axes: 'q' is not a list. Give state",
         lambda: jm.map_feasible_set(M, np.zeros((3, 1)), axes="q"),
     ),
     (
@@ -616,6 +625,56 @@ CALLS = [
         lambda: jm.Box([-1, -1], [1, 1]).to_polytope().scale("2"),
     ),
     ("Ellipsoid.P: shape () is not (n, n). Give a", lambda: jm.Ellipsoid("P", 1).volume()),
+    # Numbers in place of sequences, and the reverse.
+    ("horizons: 3 is not a list. Give a", lambda: jm.feasible.feasible_growth(M, 3)),
+    ("horizons: 0. Give a whole number of at", lambda: jm.feasible.feasible_growth(M, [3, 0])),
+    ("horizons: 2.5. Give a whole number of at", lambda: jm.feasible.feasible_growth(M, [2.5])),
+    ("mpc: is a int. Give a jm.MPC", lambda: jm.feasible.feasible_growth(3, [3])),
+    ("axes: 0 is not a list. Give state", lambda: jm.map_feasible_set(M, x, axes=0)),
+    ("x0s: shape (). Give points (B, 2), one", lambda: jm.map_feasible_set(M, 3)),
+    ("devices: array(2). Give a whole", lambda: jm.solve_many(M, [x], devices=np.array(2))),
+    ("newton_steps: [1]. Give a whole number of", lambda: fraction(newton_steps=[1])),
+    ("x0s: shape (0,). Give states (B, 2), one", lambda: fraction([])),
+    ("along: 3 is not a list. Give 2 arrays", lambda: sweep(3)),
+    ("along: has arrays of shapes []. Give 2", lambda: sweep([])),
+    ("along: has arrays of shapes [(0,), (0,)].", lambda: sweep([[], []])),
+    ("along: has arrays of shapes [(), ()].", lambda: sweep([1, 1])),
+    ("shard: 3 is not a list. Give i and n of", lambda: sweep([x, x], shard=3)),
+    ("shard: 1. Give i and n of i/n, with i from", lambda: sweep([x, x], shard=(1,))),
+    ("settings: is a int. Give a Mapping", lambda: sweep([x, x], settings=3)),
+    (
+        "max_iterations: [3]. Give a whole number",
+        lambda: jm.maximal_invariant_set(S, [[-1, -1]], BOX, M.inputs, max_iterations=[3]),
+    ),
+    (
+        "tolerance: [1]. Give a relative gap",
+        lambda: jm.sets.maximal_control_invariant_set(S, BOX, M.inputs, tolerance=[1]),
+    ),
+    ("system: is a int. Give a jm.LinearSystem", lambda: jm.sets.predecessor(3, BOX, BOX, BOX)),
+    (
+        "disturbance_matrix: shape () where (2,)",
+        lambda: jm.sets.predecessor(S, BOX, BOX, M.inputs, BOX, 3),
+    ),
+    ("system: is a int. Give a jm.LinearSystem", lambda: jm.sets.reachable_sets(3, BOX, BOX)),
+    ("sets: hold a int. Give Boxes, Polytopes", lambda: jm.sets.plot(3)),
+    ("names: 3 is not a list. Give a list", lambda: jm.joint_limits(1.0, names=3)),
+    ("units: 3 is not a list. Give three", lambda: jm.joint_limits(1.0, units=3)),
+    (
+        "names: [None] are not strings. Give a",
+        lambda: jm.sets.output_limits([[1]], -1, 1, names=[None]),
+    ),
+    (
+        "law: is a int. Give a jm.systems.LQR",
+        lambda: jm.sets.named_terminal_set("invariant", S, 3, BOX, M.inputs),
+    ),
+    ("pieces: 3 is not a list. Give a tuple", lambda: jm.sets.PolytopeUnion(3)),
+    ("n: [2]. Give a whole number of at least", lambda: jm.Polytope.empty([2])),
+    ("box: is a int. Give a jm.Box", lambda: jm.sets.Zonotope.from_box(3)),
+    ("count: [3]. Give a whole number of at", lambda: jm.Ellipsoid(np.eye(2), 1).boundary([3])),
+    ("axes: 1.5 is not a list. Name those", lambda: BOX.project(1.5)),
+    ("seconds: (). Give a time limit in", lambda: jm.explicit.critical_regions(M, seconds=())),
+    ("seconds: (). Give a time limit in", lambda: jm.explicit.exact_penalty(M, seconds=())),
+    ("rho: 'x' where real numbers are needed.", lambda: jm.explicit.exact_penalty(M, rho="x")),
 ]
 
 
@@ -689,6 +748,16 @@ def test_grids_take_numbers_for_all_axes():
     np.testing.assert_array_equal(jm.grid(-1, 1, 3), [[-1], [0], [1]])
     np.testing.assert_array_equal(jm.grid([-1, -2], [1, 2], 3), jm.grid([-1, -2], [1, 2], (3, 3)))
     np.testing.assert_array_equal(jm.grid(-1, [1, 2], (2, 3)), jm.grid([-1, -1], [1, 2], [2, 3]))
+
+
+def test_lists_are_states_of_fractions():
+    with jax.enable_x64(True):
+        assert fraction([[0, 0], [1, 1]]) == fraction(np.array([[0.0, 0], [1, 1]]))
+
+
+def test_of_no_points_there_are_no_distances():
+    assert BOX.distance(np.zeros((0, 2))).shape == (0,)
+    assert jm.explicit.critical_regions(M).law(np.zeros((0, 2))).shape == (0, 1)
 
 
 def test_numbers_are_states_where_there_is_one():

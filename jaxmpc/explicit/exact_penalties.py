@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxmpc.arrays import Reals, host_array
-from jaxmpc.checks import fail, require_kind, whole
+from jaxmpc.checks import fail, number, require_finite, require_kind, whole
 from jaxmpc.explicit.active_sets import (
     SMALLEST,
     ActivePiece,
@@ -134,12 +134,14 @@ def exact_penalty(
     Sources: Fletcher 1987, Practical Methods of Optimization, section 14.3; Kerrigan &
     Maciejowski 2000, Proc. UKACC Control; Hovd & Stoican 2014, Comput. Chem. Eng. 70.
     """
+    number("seconds", seconds, 0, "Give a time limit in seconds")
     deadline = time.monotonic() + seconds
     if method not in ("auto", "regions", "samples"):
         fail("method", f"{method!r}", 'Give "auto", "regions" or "samples"')
     samples = whole("samples", samples, 1)
-    if rho is not None and not (np.ndim(rho) == 0 and np.isfinite(rho) and rho >= 0):
-        fail("rho", f"{rho!r}", "Give one finite weight of at least 0, or None")
+    if rho is not None:
+        number("rho", rho, 0, "Give one finite weight of at least 0, or None")
+        require_finite("rho", rho)
     require_kind("mpc", mpc, MPC)
     mpc.validate()
     x0s = np.zeros((0, mpc.dimension)) if x0s is None else host_array("x0s", x0s)

@@ -7,8 +7,8 @@ from functools import cached_property
 
 import numpy as np
 
-from jaxmpc.arrays import Reals
-from jaxmpc.checks import fail, require_kind, whole
+from jaxmpc.arrays import Reals, host_array
+from jaxmpc.checks import fail, number, require_kind, whole
 from jaxmpc.explicit.active_sets import (
     DEPENDENT,
     REACH,
@@ -158,6 +158,7 @@ class CriticalRegions:
         tolerance: how far outside all regions a θ may lie, relative to the width of X_N across
         the facet that it exceeds.
         """
+        number("tolerance", tolerance, -np.inf, "Give one number")
         x, shape = self._states(x0s)
         H, h, starts = self.facets
         answer = np.full(len(x), -1)
@@ -202,11 +203,11 @@ class CriticalRegions:
         for i in np.unique(where[where >= 0]):
             gain, offset = laws[i]
             values[where == i] = x[where == i] @ gain.T + offset
-        return values.reshape(*shape, -1)
+        return values.reshape(*shape, values.shape[1])
 
     def _states(self, x0s: Reals) -> tuple[np.ndarray, tuple[int, ...]]:
         """Return parameters as rows (B, p), and the shape of one number for each: () or (B,)."""
-        x, p = np.asarray(x0s, np.float64), self.problem.dimension
+        x, p = host_array("x0s", x0s, copy=False), self.problem.dimension
         if x.ndim not in (1, 2) or x.shape[-1] != p:
             fail("x0s", f"shape {x.shape}", f"Give one state ({p},) or states (B, {p})")
         return np.atleast_2d(x), x.shape[:-1]
@@ -259,6 +260,7 @@ def critical_regions(
     Bemporad 2003, Automatica 39 (crossing facets by active sets); Lawson & Hanson 1974, ch. 23
     (least distance by NNLS).
     """
+    number("seconds", seconds, 0, "Give a time limit in seconds")
     deadline = time.monotonic() + seconds
     require_kind("problem", problem, MPC, ParametricQP)
     problem.validate()

@@ -14,7 +14,7 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.arrays import Reals, host_array
-from jaxmpc.checks import fail, require_finite
+from jaxmpc.checks import entries, fail, require_finite
 from jaxmpc.mpc.problem import MPC, at_stage, differing
 from jaxmpc.mpc.rows import Block, given_blocks
 from jaxmpc.mpc.tightening import require_room, require_tightened, with_bounds
@@ -73,10 +73,11 @@ def make_view(mpc: MPC, axes: Axes = None, fixed: Reals | None = None) -> View:
     """
     n = mpc.dimension
     names = list(mpc.system.state_names)
-    axes = tuple(range(n)) if axes is None else tuple(axes)
+    cure = f"Give state indices or names ({', '.join(names) or 'none set'})"
+    axes = tuple(range(n) if axes is None else entries("axes", axes, cure))
     axes = tuple(names.index(i) if isinstance(i, str) and i in names else i for i in axes)
     if not all(isinstance(i, int | np.integer) for i in axes):
-        fail("axes", f"{axes}", f"Give state indices or names ({', '.join(names) or 'none set'})")
+        fail("axes", f"{axes}", cure)
     axes = tuple(int(i) for i in axes)
     if not axes or len(set(axes)) != len(axes) or not all(0 <= i < n for i in axes):
         fail("axes", f"{axes}", f"Give different state indices from 0 to {n - 1}")

@@ -240,6 +240,7 @@ class FeasibleSetMap:
         `time.monotonic`, after which no round of rays begins. A set without interior, or unbounded,
         is returned as it is.
         """
+        number("gap", gap, 0, "Give a gap of at least 0")
         if isinstance(self.problem, PolicyProblem):  # rays were sent for the labels
             points, _, normals, offsets, _ = policy_hull(self.problem).bounds
             return replace(self, bound_point=points, bound_normal=normals, bound_offset=offsets)
@@ -411,6 +412,7 @@ def map_points(
     """Label the points (B, d) of a feasibility problem; settings: those of `label_chunks`. Points
     that are left at the deadline (of `time.monotonic`) get status NOT_RUN."""
     points, parts = host_array("x0s", x0s, copy=False), list[Part[Labels]]()
+    _require_points(problem, points)
     if isinstance(problem, PolicyProblem):
         return _map_policies(problem, points, settings)
     with ThreadPoolExecutor(1) as copies:
@@ -428,7 +430,6 @@ def _map_policies(
     problem: PolicyProblem, points: np.ndarray, settings: Mapping[str, Any]
 ) -> FeasibleSetMap:
     """Label points (B, d) under affine policies."""
-    _require_points(problem, points)
     if settings.get("executor") is not None:
         fail("executor", EXECUTOR, "Leave it out")
     chunk = settings.get("chunk")

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxmpc.checks import fail, require_kind
+from jaxmpc.checks import entries, fail, require_kind, whole
 from jaxmpc.feasible.hard_constraints import augmented_dynamics
 from jaxmpc.feasible.plan_polytope import DIMENSIONS, FACETS, CenteredPolytope, projected
 from jaxmpc.feasible.policy_problem import problem_of
@@ -147,10 +147,13 @@ def feasible_growth(mpc: MPC, horizons: Sequence[int]) -> Growth:
     Raises ValueError as `feasible_polytope` does, and where steps or blocks of `mpc` fit one
     horizon only.
     """
+    require_kind("mpc", mpc, MPC)
     mpc.require_constant("it has the length of one horizon", *HARD)
-    sets = tuple(feasible_polytope(replace(mpc, horizon=int(N))) for N in horizons)
+    given = entries("horizons", horizons, "Give a list, such as [5, 10, 20]")
+    every = [whole("horizons", N, 1) for N in given]
+    sets = tuple(feasible_polytope(replace(mpc, horizon=N)) for N in every)
     return Growth(
-        horizons=np.array(horizons, int),
+        horizons=np.array(every, int),
         volume=np.array([body.volume() for body in sets]),
         facets=np.array([len(np.asarray(body.h)) for body in sets]),
         sets=sets,

@@ -20,8 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxmpc.arrays import Reals
-from jaxmpc.checks import concrete, fail, require_shape
+from jaxmpc.arrays import Reals, as_array
+from jaxmpc.checks import concrete, fail, require_real, require_shape, whole
 from jaxmpc.mpc.condense import Condensed, condense
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp import linalg
@@ -52,7 +52,7 @@ def feasible_fraction(
 
 
 def membership(
-    mpc: MPC, x0s: Any, width: float = 0.02, *, scale: Any = None, newton_steps: int = STEPS
+    mpc: MPC, x0s: Any, width: Any = 0.02, *, scale: Any = None, newton_steps: int = STEPS
 ) -> Array:
     """Return 1/(1 + (δ/width)²) for each of the states x0s (B, n): (B,), between 0 and 1.
 
@@ -77,9 +77,13 @@ def membership(
         )
     mpc.validate()
     mpc = replace(mpc, soft=(), input_rate_weight=None)  # no part in what is feasible
-    x0s, width = arrays((x0s, width))
+    for name, value in (("x0s", x0s), ("width", width)):
+        require_real(name, value)
+    newton_steps = whole("newton_steps", newton_steps, 1)
+    x0s, width = (v if hasattr(v, "ndim") else np.asarray(v) for v in map(as_array, (x0s, width)))
     if x0s.ndim != 2 or x0s.shape[1] != mpc.dimension:
         fail("x0s", f"shape {x0s.shape}", f"Give states (B, {mpc.dimension}), one a row")
+    x0s, width = arrays((x0s, width))
     if concrete(width) and not (np.ndim(width) == 0 and 0 < float(width) < 1):
         fail("width", f"{width}", "Give a fraction of the limits between 0 and 1, such as 0.02")
     condensed = condense(mpc)

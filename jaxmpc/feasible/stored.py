@@ -24,7 +24,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from jaxmpc.arrays import Reals
 from jaxmpc.batches import CHUNK, Part, Timing, default_chunk, work_off
-from jaxmpc.checks import fail
+from jaxmpc.checks import counted, entries, fail, require_kind, require_real
 from jaxmpc.feasible.hard_constraints import Axes
 from jaxmpc.feasible.map import BOUNDS, EXECUTOR, MEANINGS, FeasibleSetMap, excluded
 from jaxmpc.feasible.pipeline import (
@@ -260,9 +260,11 @@ def sweep_into(
         what = "given beside shard (--overwrite, --shard)"
         fail("overwrite", what, "Delete the store before shards start")
     problem = mpc if isinstance(mpc, FeasibilityProblem) else sweep_problem(mpc, axes, fixed)
+    along = _lines(along, problem.dimension)
     if executor is not None and isinstance(problem, PolicyProblem):
         fail("executor", EXECUTOR, "Leave it out")
     settings = {"iterations": iterations, "dtype": dtype} if settings is None else settings
+    require_kind("settings", settings, Mapping)
     how: dict[str, Any] = {"shard": shard, "overwrite": overwrite, "begun": begun}
     with open_labels(path, problem, along, settings, chunk, **how) as store:
         pending = store.pending()
@@ -301,6 +303,18 @@ def sweep_into(
             whole = whole.refine(gap)
         concluded(whole)
         return whole
+
+
+def _lines(along: Any, d: int) -> list[np.ndarray]:
+    """Return the coordinates of a grid along each of d axes, checked."""
+    cure = f"Give {counted(d, 'array')} of coordinates, one a mapped state"
+    lines = entries("along", along, cure)
+    for line in lines:
+        require_real("along", line)
+    shapes = [np.shape(line) for line in lines]
+    if len(shapes) != d or any(len(shape) != 1 or 0 in shape for shape in shapes):
+        fail("along", f"has arrays of shapes {shapes}", cure)
+    return [np.asarray(line) for line in lines]
 
 
 def sweep_problem(mpc: MPC, axes: Axes = None, fixed: Reals | None = None) -> FeasibilityProblem:

@@ -13,7 +13,7 @@ import numpy as np
 import scipy
 
 from jaxmpc.arrays import Reals
-from jaxmpc.checks import fail
+from jaxmpc.checks import fail, number
 from jaxmpc.pytrees import pytree, static
 from jaxmpc.sets.convex_sets import Box, ConvexSet, Polytope, as_polytope
 from jaxmpc.sets.disturbances import supports
@@ -101,6 +101,7 @@ def maximal_control_invariant_set(
     """
     if not (isinstance(max_iterations, int) and max_iterations >= 1):
         fail("max_iterations", f"{max_iterations!r} is no positive integer", "Give one")
+    number("tolerance", tolerance, 0, "Give a relative gap")
     if not 0 < tolerance < 1:
         fail("tolerance", f"{tolerance!r} is not between 0 and 1", "Give a relative gap")
     step = one_step(system, inputs, disturbance, disturbance_matrix)

@@ -210,6 +210,6 @@ def disturbance_columns(E: Reals | None, n: int) -> np.ndarray:
     if E is None:
         return np.eye(n)
     E = host_array("disturbance_matrix", as_column(E) if np.ndim(as_array(E)) == 1 else E)
-    require_shape("disturbance_matrix", E, (n, E.shape[-1]), "One row a state")
+    require_shape("disturbance_matrix", E, (n, *E.shape[-1:]), "One row a state")
     require_finite("disturbance_matrix", E)
     return E

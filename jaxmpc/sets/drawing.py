@@ -33,6 +33,9 @@ def plot(*sets: Any, ax: Any = None, **style: Any) -> Any:
 
     if not sets:
         fail("sets", "is empty", "Give one set or more")
+    for one in sets:
+        if not hasattr(one, "dimension"):
+            fail("sets", f"hold a {type(one).__name__}", "Give Boxes, Polytopes, Ellipsoids, …")
     n = sets[0].dimension
     if n not in (2, 3) or any(s.dimension != n for s in sets):
         dims = ", ".join(str(s.dimension) for s in sets)

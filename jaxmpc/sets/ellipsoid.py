@@ -8,7 +8,14 @@ import numpy as np
 import scipy
 
 from jaxmpc.arrays import Reals, as_array, host_array, store_floats
-from jaxmpc.checks import concrete, fail, require_finite, require_shape, require_symmetric_psd
+from jaxmpc.checks import (
+    concrete,
+    fail,
+    require_finite,
+    require_shape,
+    require_symmetric_psd,
+    whole,
+)
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.linalg import solve, symmetric
 from jaxmpc.sets.fields import (
@@ -132,6 +139,7 @@ class Ellipsoid(BasicSet):
         center, L = self._ball()
         if len(L) != 2:
             fail("Ellipsoid", f"has dimension {len(L)}", "Only an ellipse can be drawn")
+        count = whole("count", count, 1)
         angles = np.arange(count) * 2 * np.pi / count
         return center + np.array([np.cos(angles), np.sin(angles)]).T @ L.T
 

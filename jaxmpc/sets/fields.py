@@ -8,7 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmpc.arrays import Reals, as_array, host_array
-from jaxmpc.checks import concrete, fail, require_finite, require_printable, require_shape
+from jaxmpc.checks import (
+    concrete,
+    entries,
+    fail,
+    require_finite,
+    require_printable,
+    require_shape,
+    whole,
+)
 
 # An array, a number, True or False, of JAX or NumPy.
 AnyArray: TypeAlias = jax.Array | np.ndarray
@@ -114,7 +122,8 @@ def points(argument: str, value: Reals, n: int) -> np.ndarray:
 
 def chosen_axes(axes: Any, n: int) -> list[int]:
     """Return the coordinates of an argument `axes`, checked."""
-    axes = [axes] if isinstance(axes, int | np.integer) else list(axes)
+    axes = [axes] if isinstance(axes, int | np.integer) else axes
+    axes = [whole("axes", axis, 0) for axis in entries("axes", axes, "Name those to keep")]
     if not axes or len(set(axes)) < len(axes) or not set(axes) <= set(range(n)):
         fail("axes", f"{axes} are not distinct numbers in 0..{n - 1}", "Name those to keep")
     return axes

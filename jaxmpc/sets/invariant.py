@@ -14,6 +14,7 @@ from jaxmpc.checks import (
     require_kind,
     require_shape,
     require_symmetric_psd,
+    whole,
 )
 from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.linalg import arrays, cholesky, eigh, floating_dtype, matmul, solve_triangular
@@ -109,7 +110,7 @@ def maximal_invariant_set(
         fail("K", f"A + BK has spectral radius {radius:.9g}, which is not below 1", cure)
     rows, newest, b = F, F, np.ones(len(F))
     reach = np.full(n, np.inf)
-    for t in range(max_iterations + 1):
+    for t in range(whole("max_iterations", max_iterations, 1) + 1):
         bounded = np.isfinite(reach).all()
         if not bounded:
             reach = extent(rows, np.ones(len(rows)))
@@ -231,7 +232,7 @@ def named_terminal_set(
     Raises ValueError for another name, for the last two without any limit, and as
     `maximal_invariant_set` and `invariant_ellipsoid` do.
     """
-    if name not in TERMINAL_SETS:
+    if not isinstance(name, str) or name not in TERMINAL_SETS:
         fail("terminal", f"{name!r}", f"Give a set, or one of {', '.join(TERMINAL_SETS)}")
     if name == "none":
         return None
@@ -239,6 +240,7 @@ def named_terminal_set(
         return states
     if states is None and inputs is None:
         fail("terminal", f"{name!r} without limits", "Give states or inputs, or 'none'")
+    require_kind("law", law, LQR)
     assert law is not None
     if name == "ellipsoid":
         return invariant_ellipsoid(system, law.K, law.P, states, inputs)

@@ -14,7 +14,7 @@ import numpy as np
 from jax.typing import DTypeLike
 
 from jaxmpc.arrays import Reals, host_array
-from jaxmpc.checks import fail, require_finite
+from jaxmpc.checks import entries, fail, require_finite
 from jaxmpc.pytrees import record
 from jaxmpc.sets.convex_sets import Box, Polytope, product
 
@@ -78,6 +78,9 @@ def joint_limits(
 
     Raises ValueError for limits that are not pairs, of different lengths, NaN or empty.
     """
+    if names is not None:
+        names = strings("names", names)
+    units = entries("units", units, "Give three, of position, velocity and torque")
     limits = {"position": position, "velocity": velocity, "torque": torque}
     pairs = {key: limit_pair(key, value) for key, value in limits.items()}
     ends = [(key, end) for key, pair in pairs.items() for end in pair]
@@ -85,14 +88,14 @@ def joint_limits(
     for key, end in ends:
         if end.shape not in ((), (n,)):
             fail(key, f"{end.size} entries for {n} joints", "Give one a joint, or a number")
-    if isinstance(units, str) or len(units) != 3:
+    if len(units) != 3:
         fail("units", f"{units!r} is not one of position, velocity, torque", "Give three")
     if names is None:
         numbers = range(1, n + 1)
         q, dq, tau = ([f"{letter}{i}" for i in numbers] for letter in ("q", "dq", "tau"))
     else:
         q, dq, tau = ([name + what for name in names] for what in ("", " velocity", " torque"))
-    unit = [[u] * n if isinstance(u, str) else list(u) for u in units]
+    unit = [[u] * n if isinstance(u, str) else strings("units", u) for u in units]
     if any(len(u) != n for u in unit):
         fail("units", f"{units!r} does not fit {n} joints", "Give a string, or one a joint")
     selector = np.eye(2 * n)
@@ -140,8 +143,9 @@ def output_limits(
             fail(f"{argument}.{name}", f"shape {end.shape} is not ({p},)", "Give one an output")
         ends.append(np.broadcast_to(end, p))
     Box(*ends).validate(argument, p)
+    names, units = strings("names", names), strings("units", units)
     for name, given in (("names", names), ("units", units)):
-        if isinstance(given, str) or len(given) not in (0, p):
+        if len(given) not in (0, p):
             fail(name, f"{given!r} is not one string an output", f"Give {p} strings, or none")
     names = names or [f"y{i + 1}" for i in range(p)]
     units = units or [""] * p
@@ -151,6 +155,14 @@ def output_limits(
     rows = np.flatnonzero(np.isfinite(h)).tolist()
     labels = tuple(f"{names[i % p]} {texts[i]} {units[i % p]}".rstrip() for i in rows)
     return Polytope(H[rows], h[rows], labels)
+
+
+def strings(argument: str, values: Any) -> list[str]:
+    """Return the strings of a sequence, checked."""
+    found = entries(argument, values, "Give a list of strings")
+    if not all(isinstance(text, str) for text in found):
+        fail(argument, f"{found!r} are not strings", "Give a list of strings")
+    return found
 
 
 def limit_pair(argument: str, limit: Any) -> tuple[np.ndarray, np.ndarray]:

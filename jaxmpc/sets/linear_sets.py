@@ -21,7 +21,7 @@ import numpy as np
 import scipy
 
 from jaxmpc.arrays import Reals, as_array, dimensions, host_array, store_floats
-from jaxmpc.checks import concrete, fail, number, require_finite, require_real
+from jaxmpc.checks import concrete, fail, number, require_finite, require_kind, require_real, whole
 from jaxmpc.pytrees import pytree, record, static
 from jaxmpc.sets import generators, geometry, polyhedra
 from jaxmpc.sets.fields import (
@@ -199,7 +199,7 @@ class Polytope(LinearSet):
     @classmethod
     def empty(cls, n: int) -> "Polytope":
         """Return the empty set in R^n, as the row 0'x <= -1."""
-        return cls(np.zeros((1, n)), np.array([-1.0]))
+        return cls(np.zeros((1, whole("n", n, 1))), np.array([-1.0]))
 
     @property
     def dimension(self) -> int:
@@ -923,6 +923,7 @@ class Zonotope(LinearSet):
     @classmethod
     def from_box(cls, box: Box) -> "Zonotope":
         """Return a bounded box as a zonotope, one generator a coordinate of positive width."""
+        require_kind("box", box, Box)
         return box.to_zonotope()
 
     @property

@@ -143,7 +143,9 @@ class BasicSet(ConvexSet):
         values = host_array("x", given)
         if not np.isfinite(values).all():
             fail("x", "holds NaN or infinity", "Give finite numbers")
-        return np.array([self._closest(v) for v in values]) if many else self._closest(values)
+        if not many:
+            return self._closest(values)
+        return np.array([self._closest(v) for v in values]).reshape(values.shape)
 
     def distance(self, x: Reals) -> Any:
         """Return the Euclidean distance of x (n,), or of each of many (k, n), to the set; 0

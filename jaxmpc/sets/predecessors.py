@@ -151,7 +151,7 @@ def one_step(
 ) -> OneStep:
     """Return the data of x⁺ = A x + B u + c + E w, checked, with what equalities fix of the inputs
     (lower = upper, or two opposite rows) taken out."""
-    every = (system,) if isinstance(system, LinearSystem) else tuple(system)
+    every = tuple(system) if isinstance(system, Sequence) else (system,)
     if not every:
         fail("system", "holds no system", "Give one, or the vertices of a hull")
     for one in every:

@@ -4,7 +4,7 @@ from typing import Literal
 
 import numpy as np
 
-from jaxmpc.checks import fail, whole
+from jaxmpc.checks import fail, require_kind, whole
 from jaxmpc.sets.convex_sets import Box, LinearSet, Polytope, as_polytope
 from jaxmpc.sets.predecessors import one_step
 from jaxmpc.systems.system import LinearSystem, host_matrices
@@ -50,6 +50,7 @@ def reachable_sets(
     """
     if direction not in DIRECTIONS:
         fail("direction", f"{direction!r}", 'Give "forward" or "backward"')
+    require_kind("system", system, LinearSystem)
     count = whole("steps", steps, 0)
     first = _checked("X0", X0, system.n)
     if first is None:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from jaxmpc.arrays import Reals, as_array
-from jaxmpc.checks import fail
+from jaxmpc.checks import entries, fail, require_kind
 from jaxmpc.pytrees import record
 from jaxmpc.sets import drawing
 from jaxmpc.sets.fields import AnyTruth
@@ -24,6 +24,12 @@ class PolytopeUnion:
 
     pieces: tuple[Polytope, ...]
     apart: bool = False
+
+    def __post_init__(self) -> None:
+        pieces = entries("pieces", self.pieces, "Give a tuple of Polytopes")
+        for piece in pieces:
+            require_kind("pieces", piece, Polytope)
+        object.__setattr__(self, "pieces", tuple(pieces))
 
     def is_empty(self) -> bool:
         """Return whether no piece has a point."""

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 
-from jaxmpc.checks import fail
+from jaxmpc.checks import entries, fail, whole
 from jaxmpc.files import differences, versions
 from jaxmpc.store.reading import (
     array_of,
@@ -145,9 +145,11 @@ class Store:
         self.constants = {**axes, **(constants or {})}
         self.shape = tuple(len(axis.data) for axis in axes.values())
         self.dimensions = tuple(axes)
-        i, n = (0, 1) if shard is None else shard
-        if not 0 <= i < n:
-            fail("shard", f"{i}/{n}", "Give i/n with i from 0 to n - 1")
+        cure = "Give i and n of i/n, with i from 0 to n - 1"
+        pair = entries("shard", (0, 1) if shard is None else shard, cure)
+        if len(pair) != 2 or not whole("shard", pair[0], 0) < whole("shard", pair[1], 0):
+            fail("shard", "/".join(map(str, pair)), cure)
+        i, n = pair
         chunk, self.block_shape = self._blocks(chunk, part, n, overwrite)
         self.regions = regions(self.shape, self.block_shape)
         self.own = range(i, len(self.regions), n)

@@ -57,7 +57,7 @@ def test_output_limits_are_rows_of_C():
         (lambda: joint_limits(1, units=(("rad", "m"), "", "")), "units: .* does not fit 1"),
         (lambda: output_limits([1, 2], 0, 1), r"C: shape \(2,\) is not \(p, n\)"),
         (lambda: output_limits([[1, 2]], [0, 0], 1), r"limits.lower: shape \(2,\) is not \(1,\)"),
-        (lambda: output_limits([[1, 2]], 0, 1, "y"), "names: 'y' is not one string an output"),
+        (lambda: output_limits([[1, 2]], 0, 1, "y"), "names: 'y' is not a list. Give a list of"),
         (lambda: output_limits([[np.inf, 2]], 0, 1), "C: holds NaN"),
     ],
 )
