@@ -49,10 +49,13 @@ def store_floats(instance: Any, *names: str) -> None:
     NumPy arrays of whole numbers: one leaf each, which can be differentiated and stacked.
 
     All else stays as it is: numbers, JAX's arrays, the placeholders by which JAX rebuilds an
-    object, and what is no array of numbers, which `validate` refuses."""
+    object, and what is no array of numbers, which `validate` refuses. Raises ValueError for rows of
+    different lengths and for masked arrays that hide entries."""
     for name in names:
         value = getattr(instance, name)
-        if isinstance(value, list | tuple) and dimensions(value) is not None:
+        if isinstance(value, list | tuple | np.ma.MaskedArray):
+            if dimensions(value) is None or isinstance(value, np.ma.MaskedArray):
+                require_real(name, value)
             value = _array(value)
         if isinstance(value, np.ndarray) and value.dtype.kind in "iu":
             value = value.astype(float)

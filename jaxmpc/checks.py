@@ -164,6 +164,9 @@ def require_real(argument: str, value: Any) -> None:
     """Raise unless a readable `value` is an array, or nested lists, of real numbers."""
     if not concrete(value):
         return
+    if _hides(value):
+        cure = "Give numbers in their place, by filled(...), or leave these rows out"
+        fail(argument, "is a masked array that hides entries", cure)
     try:
         array = value if hasattr(value, "ndim") else np.asarray(value)
     except (TypeError, ValueError):
@@ -171,6 +174,13 @@ def require_real(argument: str, value: Any) -> None:
     if array.dtype.kind not in "biuf" and array.dtype.name != "bfloat16":
         found = shown(value) if np.ndim(array) == 0 else f"entries of type {array.dtype}"
         fail(argument, f"{found} where real numbers are needed", "Give an array or nested lists")
+
+
+def _hides(value: Any) -> bool:
+    """Return whether a masked array of NumPy, or one in nested lists, hides entries."""
+    if isinstance(value, list | tuple):
+        return any(map(_hides, value))
+    return isinstance(value, np.ma.MaskedArray) and bool(np.ma.is_masked(value))
 
 
 def counted(count: int, what: str) -> str:

@@ -38,6 +38,11 @@ def fraction(x0s=((0, 0),), **more):
     return jm.feasible.feasible_fraction(M, x0s, **more)
 
 
+def hiding(array):
+    """Return the array with its first entry hidden."""
+    return np.ma.array(array, mask=np.arange(array.size).reshape(array.shape) == 0)
+
+
 def sweep(along, **more):
     return jm.feasible.sweep_into("nowhere", M, along, **more)
 
@@ -625,6 +630,21 @@ CALLS = [
         lambda: jm.Box([-1, -1], [1, 1]).to_polytope().scale("2"),
     ),
     ("Ellipsoid.P: shape () is not (n, n). Give a", lambda: jm.Ellipsoid("P", 1).volume()),
+    # Rows of different lengths, when an object is made, and masks.
+    ("A: [[1, 2], [3]] is not an array of", lambda: jm.LinearSystem([[1, 2], [3]], B)),
+    ("c: [[1, 2], [3]] is not an array of", lambda: jm.LinearSystem(A, B, c=[[1, 2], [3]])),
+    ("upper: [1, [2]] is not an array of", lambda: jm.Box([0, 0], [1, [2]])),
+    ("H: [[1, 2], [3]] is not an array of", lambda: jm.Polytope([[1, 2], [3]], [1, 1])),
+    ("Q: [[1, 2], [3]] is not an array of", lambda: mpc(Q=[[1, 2], [3]])),
+    ("A: is a masked array that hides entries. Give", lambda: jm.LinearSystem(hiding(A), B)),
+    ("lower: is a masked array that hides", lambda: jm.Box(hiding(x), [1, 1])),
+    ("x0: is a masked array that hides", lambda: jm.solve(M, hiding(x))),
+    ("x0: is a masked array that hides", lambda: jm.solve(M, list(hiding(x)))),
+    ("x0s: is a masked array that hides", lambda: jm.solve_many(M, [hiding(x), x])),
+    ("x0s: is a masked array that hides", lambda: jm.map_feasible_set(M, hiding(A))),
+    ("P: is a masked array that hides", lambda: jm.solve_qp(qp(P=hiding(np.eye(2))))),
+    ("x0: is a masked array that hides", lambda: jm.simulate(jm.Controller(M), S, hiding(x), 2)),
+    ("value: is a masked array that hides", lambda: jm.Parameter(hiding(x))),
     # Numbers in place of sequences, and the reverse.
     ("horizons: 3 is not a list. Give a", lambda: jm.feasible.feasible_growth(M, 3)),
     ("horizons: 0. Give a whole number of at", lambda: jm.feasible.feasible_growth(M, [3, 0])),
@@ -748,6 +768,13 @@ def test_grids_take_numbers_for_all_axes():
     np.testing.assert_array_equal(jm.grid(-1, 1, 3), [[-1], [0], [1]])
     np.testing.assert_array_equal(jm.grid([-1, -2], [1, 2], 3), jm.grid([-1, -2], [1, 2], (3, 3)))
     np.testing.assert_array_equal(jm.grid(-1, [1, 2], (2, 3)), jm.grid([-1, -1], [1, 2], [2, 3]))
+
+
+def test_masked_arrays_that_hide_nothing_are_arrays():
+    box = jm.Box(np.ma.array([-1, -1]), np.ma.array([1.0, 1.0]))
+    plan = jm.solve(mpc(states=box), np.ma.array(x), solver=jm.ADMM(newton_steps=0))
+    np.testing.assert_array_equal(plan.states, 0)
+    assert not isinstance(box.upper, np.ma.MaskedArray)
 
 
 def test_lists_are_states_of_fractions():

@@ -102,7 +102,7 @@ def checked_array(name: str, value: Any, shapes: Sequence[tuple[int, ...]]) -> A
 
 
 def _real_array(name: str, value: Any) -> Any:
-    if isinstance(value, np.ndarray) and value.dtype.kind in "iuf":  # the usual case, and fast
+    if type(value) is np.ndarray and value.dtype.kind in "iuf":  # the usual case, and fast
         return value
     value = as_array(value)
     if not isinstance(value, jax.Array):
