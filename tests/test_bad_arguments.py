@@ -643,7 +643,6 @@ CALLS = [
     ("x0s: is a masked array that hides", lambda: jm.solve_many(M, [hiding(x), x])),
     ("x0s: is a masked array that hides", lambda: jm.map_feasible_set(M, hiding(A))),
     ("P: is a masked array that hides", lambda: jm.solve_qp(qp(P=hiding(np.eye(2))))),
-    ("x0: is a masked array that hides", lambda: jm.simulate(jm.Controller(M), S, hiding(x), 2)),
     ("value: is a masked array that hides", lambda: jm.Parameter(hiding(x))),
     # Numbers in place of sequences, and the reverse.
     ("horizons: 3 is not a list. Give a", lambda: jm.feasible.feasible_growth(M, 3)),

@@ -1,5 +1,7 @@
 """Cures that error messages and statuses name: they are tried, and they help."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -100,3 +102,15 @@ def test_lost_states_between_the_points_of_a_grid():
     report = jm.recursive_feasibility(jm.MPC(joint, [50, 1], 0.1, 4, **limits), steps=5)
     assert report.law.holds is False and 0 < report.lost_by_law < 1e-3 * report.volume
     assert report.loops.counts()["lost after one step"] > 0
+
+
+def test_what_helps_for_flat_sets_is_named_and_helps():
+    """u₀ = −10 x₂ leads (x₁, x₂) to 0 in one step where x₁ = −x₂/20, |x₂| ≤ 1/10: a segment."""
+    mpc = problem(1, terminal_set=jm.Box([0, 0], [0, 0]))
+    with pytest.raises(ValueError, match=r"flat.*critical_regions\(mpc\)"):
+        jm.feasible_polytope(mpc)
+    (region,) = jm.explicit.critical_regions(mpc).regions
+    ends = region.vertices[np.argsort(region.vertices[:, 1])]
+    np.testing.assert_allclose(ends, [[0.005, -0.1], [-0.005, 0.1]], atol=1e-12)
+    with pytest.raises(ValueError, match="^problem: .* one value of the parameters, .* Solve"):
+        jm.explicit.critical_regions(replace(mpc, inputs=jm.Box([0], [0])))

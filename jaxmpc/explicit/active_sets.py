@@ -339,8 +339,10 @@ class GivenProgram(NamedTuple):
         if not rank:
             return self
         if rank == n:
-            what = "leaves, with the rows, one value of the parameters"
-            fail("within", what, "Solve that one QP")
+            only = column[:n] * np.linalg.lstsq(both[:, :n], both[:, n], rcond=FLAT)[0]
+            at = np.array2string(only, precision=6, suppress_small=True)
+            what = f"its rows leave one value of the parameters, {at}"
+            fail("problem", what, "Solve the QP there")
         rows = np.where(np.abs(Vt[:rank]) <= 1e-14, 0.0, Vt[:rank])
         offsets = rows @ np.linalg.lstsq(both[:, :n], both[:, n], rcond=FLAT)[0]
         # What is rounding here would be the only limit of rows through the origin.

@@ -53,7 +53,10 @@ def feasible_polytope(mpc: MPC) -> Polytope:
         sets = backward(problem.mpc)
         body = sets if isinstance(sets, str) else sets[1]
     if isinstance(body, str):
-        fail("mpc", body, "Map it with map_feasible_set, which has no such limit")
+        cure = "Map it with map_feasible_set, which has no such limit"
+        if "flat" in body:
+            cure = "The regions of jm.explicit.critical_regions(mpc), in fewer dimensions, fill it"
+        fail("mpc", body, cure)
     return body.polytope
 
 

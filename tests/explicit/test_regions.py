@@ -140,7 +140,10 @@ class TestRegions:
         point = jm.Box(np.array([0.5, 0.0]), np.array([0.5, 0.0]))
         for changed, message in [
             (replace(mpc, terminal_set=nowhere), "empty"),
-            (replace(mpc, states=point), "one value of the parameters"),
+            (
+                replace(mpc, states=point),
+                r"^problem: .* one value of the parameters, \[ *0.5",
+            ),
             (replace(mpc, terminal_set=jm.Ellipsoid(np.eye(2), 0.5)), "ellipsoid"),
             (replace(mpc, soft=(Soft(np.eye(2), upper=np.ones(2)),)), "soft"),
         ]:
