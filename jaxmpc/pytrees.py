@@ -35,7 +35,15 @@ def record(cls: T) -> T:
     cls.__init__ = _naming_arguments(cls.__init__)  # type: ignore[misc]
     if cls.__repr__ is object.__repr__:
         cls.__repr__ = short_text  # type: ignore[method-assign, assignment]
+    if cls.__getstate__ is object.__getstate__:
+        cls.__getstate__ = _given  # type: ignore[method-assign, assignment]
     return cls
+
+
+def _given(instance: Any) -> dict[str, Any]:
+    """Return what copies and pickles of a record hold: its fields. What it keeps beside them, such
+    as compiled programs and their locks, is made again from these when it is next used."""
+    return {f.name: getattr(instance, f.name) for f in dataclasses.fields(instance)}
 
 
 def _naming_arguments(make: Callable[..., None]) -> Callable[..., None]:

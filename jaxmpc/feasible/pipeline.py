@@ -99,6 +99,10 @@ class OnDemand(Generic[T]):
         assert self._value is not None
         return self._value
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what copies and pickles hold: the thing itself, not how to fetch it."""
+        return {"_fetch": None, "_value": self.get()}
+
 
 @record
 class Labels:

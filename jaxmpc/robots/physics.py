@@ -62,13 +62,18 @@ class Physics:
             fail("model", f"MJX does not support it: {str(error).rstrip('.')}", cure)
         self.constraints = len(blank._impl.efc_J)
         self.rows = self.constraints > 0
-        self.tamed = TAMED if self.rows or model.ntendon else {}
         placed = blank._impl.contact.dim.size or np.any(model.eq_type != EQUALITY_OF_JOINTS)
         light = getattr(model, "flg_gravcomp", False) or np.any(model.body_gravcomp)
         in_fluid = model.opt.density or model.opt.viscosity or np.any(model.opt.wind)
         # Whether a force depends on where the bodies are, other than through the joints.
         led = np.any(model.actuator_trntype > TRANSMISSION_BY_JOINT)
         self.posed = bool(model.ntendon or light or in_fluid or led or (self.rows and placed))
+
+    @property
+    def tamed(self) -> dict[Any, Callable]:
+        """Return the operations to put in place of others, for their derivatives. (No field: they
+        cannot be pickled.)"""
+        return TAMED if self.rows or self.model.ntendon else {}
 
     def step(self, x: Array, u: Array, numbers: Mapping[str, Any] | None = None) -> Array:
         """Return x = (qpos, qvel, act) one physics step later: a function of x, u and nothing

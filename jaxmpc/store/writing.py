@@ -192,6 +192,11 @@ class Store:
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what copies and pickles hold, which are for reading: no locks, and nobody to
+        call."""
+        return {**vars(self), "_locks": [], "_begun": int, "_aside": None}
+
     def close(self) -> None:
         """Let other processes write. A new store without a block, that was to replace another, is
         no more."""
