@@ -104,6 +104,8 @@ class LinearFeedback:
     mpc: weights, limits and horizon by which runs are evaluated, as for a Controller. K (m, n).
     plant: a Robot, which defines the coordinates ξ and the limits; None: ξ = x. References r (n,)
     and s (m,), or rows of them of which the first counts, as in `Controller`; zero for none.
+    Of a state that holds NaN u is NaN, where that of a Controller is finite, and no status tells;
+    the law has no memory, so that the next finite state has its u again.
     """
 
     mpc: MPC

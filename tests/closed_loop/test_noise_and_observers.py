@@ -325,3 +325,12 @@ def test_bad_noise_and_observers_are_named():
     ):  # fmt: skip
         with pytest.raises(ValueError, match=message):
             call()
+
+
+def test_a_law_gives_nan_of_nan_and_forgets_it():
+    """A Controller's u stays finite; a law says what it has, and each state has its own."""
+    bad = np.array([0.1, np.nan])
+    states = np.stack([np.array([0.01, 0.0]), bad])
+    inputs = jax.vmap(lambda x: LAW(x).u)(states)
+    np.testing.assert_array_equal(np.isnan(inputs[:, 0]), [False, True])
+    np.testing.assert_array_equal(LAW(states[0], LAW(bad)).u, inputs[0])
