@@ -12,6 +12,7 @@ from problems import MINIMAL_FILE
 from pydantic import TypeAdapter
 
 from jaxmpc.app.config import Config, load, load_robot_config, sweep_points
+from jaxmpc.app.config.loading import from_results
 from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
@@ -106,6 +107,47 @@ def test_axes_by_name_index_and_slice(write):
     assert projected.fixed is None
 
 
+def test_rows_of_outputs_are_named_by_their_place_in_the_file(write):
+    """Hard and soft ones count together there, and apart in an `MPC`."""
+    rows = "\n[[outputs]]\nC = [[1.0, 0.0]]\nupper = [1.0]\n"
+    bad = rows + "lower = [2.0]\n"
+    for text, place in ((rows + "rho = 1.0" + bad, 1), (rows + bad + "rho = 1.0", 1), (bad, 0)):
+        with pytest.raises(ValueError, match=rf"outputs\.{place}: is empty"):
+            load(write(more=text)).build_mpc()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "changes"),
+    [
+        ("u_max = [1.0]", "u_max = inf", {"inputs": Box([-1.0], [np.inf])}),
+        ("u_max = [1.0]", "u_max = [1.0]\ninput_rate_limit = inf", {"input_rate_limit": [np.inf]}),
+        ("dt = 1.0", "dt = 1.0\nc = 0.1", {"c": [0.1, 0.1]}),
+        (
+            "[sweep]",
+            "[disturbance]\nw_min = -0.1\nw_max = 0.2\nE = [0.0, 1.0]\n[sweep]",
+            {"disturbance": Box([-0.1], [0.2]), "disturbance_matrix": [[0.0], [1.0]]},
+        ),
+        (
+            "[sweep]",
+            "[disturbance]\nw_min = -0.1\nw_max = 0.2\n[sweep]",
+            {"disturbance": Box([-0.1, -0.1], [0.2, 0.2])},
+        ),
+    ],
+)
+def test_a_file_takes_what_python_takes(write, tmp_path, old, new, changes):
+    config = load(write(old, new))
+    mpc, again = config.build_mpc(), tmp_path / "again.toml"
+    for name, value in changes.items():
+        found = getattr(mpc.system if name == "c" else mpc, name)
+        jax.tree.map(
+            np.testing.assert_array_equal,
+            found,
+            np.asarray(value) if isinstance(value, list) else value,
+        )
+    again.write_text(config.to_toml())
+    assert load(again).to_dict() == config.to_dict() == from_results(config.to_dict()).to_dict()
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
@@ -135,6 +177,10 @@ def test_axes_by_name_index_and_slice(write):
         ("grid = [3, 4]", "axes = ['p']\ngrid = [3]", "sweep.fixed: 2 states, 1 mapped"),
         ("[5.0, 5.0]", "[inf, 5.0]", "no finite range"),
         ("[system]", "[system", "is no TOML"),
+        # The first thing wrong alone, not what else a key of several types could be.
+        ("R = [1.0]", "R = [1.0]\nrho = -1", "cost.rho: Input should be greater than or .* 0. Got"),
+        ("grid = [3, 4]", "grid = [1, 1]", "sweep.grid: Input should be .* to 2. Got 1"),
+        ("[sweep]", "[outputs]\nC = [[1.0, 0.0]]\nupper = [1.0]\n[sweep]", r"Write \[\[outputs"),
     ],
 )
 def test_bad_input_is_named(write, old, new, message):

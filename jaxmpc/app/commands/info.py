@@ -23,6 +23,8 @@ class Info(InfoOptions):
         """Print the report. Raises ValueError for options and files that make no sense."""
         if self.html is not None and not self.html.parent.is_dir():
             fail(f"--html {self.html}", "its folder does not exist", "Make it, or give another")
+        if self.html is not None and self.html.is_dir():
+            fail(f"--html {self.html}", "is a folder", "Name a file in it")
         config = configs.load(self.config, given_options(self, "horizon", "terminal"), "info")
         report = offline_report(
             config.build_controlled(),

@@ -78,6 +78,28 @@ class LinearLoops:
         return run.on_host(), w
 
 
+def hard_outputs(
+    config: configs.Config, states: np.ndarray, inputs: np.ndarray
+) -> list[tuple[Any, np.ndarray]]:
+    """Return the hard rows of [[outputs]], each with the points (x, u) (B, T, n + m) of loops at
+    which a plan made there, or a step before, holds them."""
+    points = np.concatenate([states[:, :-1], inputs], axis=-1)
+    m, found = inputs.shape[-1], list[tuple[Any, np.ndarray]]()
+    for rows in config.outputs:
+        usual = config.mpc.constrained_stages or (int(not config.mpc.constrain_initial),)
+        first = min(rows.stages or usual)
+        if rows.rho is not None or first > 1:
+            continue
+        C = np.asarray(rows.C)
+        D = np.zeros((len(C), m)) if rows.D is None else np.asarray(rows.D)
+        lower, upper = (
+            np.full(len(C), free) if end is None else np.asarray(end)
+            for end, free in ((rows.lower, -np.inf), (rows.upper, np.inf))
+        )
+        found.append(((np.hstack([C, D]), lower, upper), points[:, first:]))
+    return found
+
+
 def simulate_problem(loops: LinearLoops, output: Path, overwrite: bool) -> None:
     """Simulate the closed loops of a problem file, write the files, print the table.
 
@@ -102,10 +124,10 @@ def simulate_problem(loops: LinearLoops, output: Path, overwrite: bool) -> None:
         run, w = loops.run(mpc, x0s)
     states, inputs, status = (np.asarray(v) for v in (run.states, run.inputs, run.status))
     planned = status[:, 0] == Status.SOLVED
-    limits = (config.state_limits(), states), (mpc.inputs, inputs)
+    of_states = [(config.state_limits(), states), *hard_outputs(config, states, inputs)]
+    limits = [*of_states, (mpc.inputs, inputs)]
     kept = np.all([rows_kept(*pair).all(axis=(1, 2)) for pair in limits], axis=0) & planned
-    excess = row_violations(*limits[0])[planned]
-    worst = float(excess.max(initial=0.0))
+    worst = max(float(row_violations(*pair)[planned].max(initial=0.0)) for pair in of_states)
     solved = float((status[planned] == Status.SOLVED).mean()) if planned.any() else float("nan")
     cost = float(np.asarray(run.stage_cost)[planned].sum(axis=1).mean()) if planned.any() else None
     summary = {
@@ -136,7 +158,7 @@ def simulate_problem(loops: LinearLoops, output: Path, overwrite: bool) -> None:
         ("with a plan", f"{planned.sum():,} of {loops.count:,} starts; the rest counts no further"),
         *[("- outside", f"{len(outside):,} begin beyond a limit: {text}") for text in outside[:1]],
         ("limits kept", f"{kept.sum():,} of {planned.sum():,} loops"),
-        ("worst", f"{worst:.3g} beyond a state limit, in its unit"),
+        ("worst", f"{worst:.3g} beyond a limit of states or outputs, in its unit"),
         ("plans solved", f"{100 * solved:.2f} %" if planned.any() else "none"),
         ("cost", "none" if cost is None else f"{cost:.6g}, mean of the loops with a plan"),
         ("files", " ".join(str(output / name) for name in FILES)),

@@ -31,12 +31,14 @@ from jaxmpc.mpc.condense import condensed_bytes
 
 # Keys for which a number may stand, and how many entries the list has.
 NUMBERS = {
+    "system": {"c": "n"},
     "limits": {
         **dict.fromkeys(("x_min", "x_max"), "n"),
         **dict.fromkeys(("u_min", "u_max", "input_rate_limit"), "m"),
     },
     "cost": {"Q": "n", "P": "n", "R": "m", "input_rate_weight": "m"},
     "reference": {"state": "n", "input": "m"},
+    "disturbance": {"w_min": "p", "w_max": "p"},
 }
 # A problem of a hundred states takes a tenth of that; what tomllib makes of a byte, up to 10 kB.
 MOST_BYTES = 10**6
@@ -108,16 +110,20 @@ def from_results(document: Mapping[str, Any], command: str = "sweep") -> Config:
 
 def _spread(document: Mapping[str, Any]) -> dict[str, Any]:
     """Return a file in which numbers stand for lists, and a flat list for the column B of a single
-    input, with these lists: as Python takes them."""
+    input or E of a single disturbance, with these lists: as Python takes them."""
     found = {key: dict(part) if isinstance(part, dict) else part for key, part in document.items()}
     system = found.get("system")
     A, B = (system.get(key) if isinstance(system, dict) else None for key in ("A", "B"))
     if not isinstance(system, dict) or not isinstance(A, list | tuple):
         return found
-    if isinstance(B, list | tuple) and not any(isinstance(row, list | tuple) for row in B):
-        system["B"] = B = [[number] for number in B]
+    against = found.get("disturbance")
+    system["B"] = B = _column(B)
+    if isinstance(against, dict) and "E" in against:
+        against["E"] = _column(against["E"])
     try:
         sizes = {"n": len(A), "m": len(B[0])}  # type: ignore[index, arg-type]
+        E = against.get("E") if isinstance(against, dict) else None
+        sizes["p"] = sizes["n"] if E is None else len(E[0])
     except (TypeError, IndexError, KeyError):
         return found
     for section, keys in NUMBERS.items():
@@ -128,6 +134,13 @@ def _spread(document: Mapping[str, Any]) -> dict[str, Any]:
             if type(value) in (int, float) and (section != "cost" or sizes[size] == 1):
                 part[key] = [value] * sizes[size]
     return found
+
+
+def _column(value: Any) -> Any:
+    """Return a flat list as a matrix of one column, anything else as it is."""
+    if not isinstance(value, list | tuple) or any(isinstance(row, list | tuple) for row in value):
+        return value
+    return [[number] for number in value]
 
 
 def holds_system(path: str | Path) -> bool:
@@ -186,6 +199,8 @@ def _error_message(error: ValidationError, whole: Any) -> str:
         return f"{key} is missing. Add it (jaxmpc sweep --help lists all keys)"
     if first["type"] == "dataclass_type":
         return f"{key}: is no section. Write [{key}] above its keys"
+    if where == ["outputs"] and first["type"] == "tuple_type":
+        return "outputs: is no list of sections. Write [[outputs]] above the keys of each"
     same = [e for e in error.errors() if place(e) == where]
     forms = _forms(_annotation(whole, where))
     if forms and all(e["type"] in _OF_TYPES for e in same):
@@ -194,10 +209,12 @@ def _error_message(error: ValidationError, whole: Any) -> str:
         *others, last = forms
         needed = f"{', '.join(others)} or {last}" if others else last
         return f"{key}: {shown(given)} where {needed} is needed. {meant}".rstrip()
+    # A value of the right type is wrong for what it is, a list for its first wrong entry.
+    same = [e for e in same if e["type"] not in (*_OF_TYPES, "too_short")] or same
     problems = dict.fromkeys(e["msg"].removeprefix("Value error, ") for e in same)
     # TOML and the help say list, Python tuple.
     text = "; or ".join(problems).replace("tuple", "list").replace("Tuple", "List")
-    return f"{key}: {text}. Got {shown(first['input'])}"
+    return f"{key}: {text}. Got {shown(same[0]['input'])}"
 
 
 # Kinds of errors that a value of another type gives, in pydantic's words.

@@ -87,9 +87,9 @@ class LimitsSection:
     margin: Annotated[Number, Field(ge=0, lt=1)] = 0.0
     H_x: Matrix | None = None  # (r, n)
     h_x: Vector | None = None  # (r,)
-    u_min: Vector  # (m,)
-    u_max: Vector  # (m,)
-    input_rate_limit: Vector | None = None  # (m,): |u_k - u_{k-1}| <= input_rate_limit
+    u_min: Limits  # (m,), -inf where free
+    u_max: Limits  # (m,), inf where free
+    input_rate_limit: Limits | None = None  # (m,): |u_k - u_{k-1}| <= it, inf where free
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -302,6 +302,12 @@ class Config:
             "terminal_set": "mpc.H_f" if mpc.H_f else "mpc.P_f" if mpc.P_f else "mpc.terminal",
             **({"states": "limits.H_x"} if limits.H_x is not None else {}),
         }
+        rows = re.fullmatch(r"(outputs|soft)\[(\d+)\](.*)", argument)
+        if rows is not None:  # the place of these rows in the file, where hard and soft ones mix
+            soft = rows[1] == "soft"
+            places = [i for i, each in enumerate(self.outputs) if (each.rho is not None) == soft]
+            if int(rows[2]) < len(places):
+                return f"outputs.{places[int(rows[2])]}{rows[3]}{colon}{rest}"
         return found.get(argument, KEYS.get(argument, argument)) + colon + rest
 
     def to_dict(self, command: str = "sweep") -> dict[str, Any]:
