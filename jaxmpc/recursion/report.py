@@ -75,6 +75,9 @@ class RecursionReport:
         if len(self.loops.x0s):
             rows.append(("samples", f"{len(self.loops.x0s):>10,}  of {self.loops.steps} steps"))
             rows.append(("- feasible", f"{feasible:>10,}"))
+            unknown = int(np.sum(self.loops.label == 0))
+            if unknown:
+                rows.append(("- without a label", f"{unknown:>10,}"))
             for name, count in counts.items():
                 why = f" ({self.loops.why_undecided()})" if name == "undecided" and count else ""
                 share = f"{count / max(feasible, 1):8.3%} of the feasible{why}"

@@ -120,7 +120,6 @@ def test_rows_of_outputs_are_named_by_their_place_in_the_file(write):
     ("old", "new", "changes"),
     [
         ("u_max = [1.0]", "u_max = inf", {"inputs": Box([-1.0], [np.inf])}),
-        ("u_max = [1.0]", "u_max = [1.0]\ninput_rate_limit = inf", {"input_rate_limit": [np.inf]}),
         ("dt = 1.0", "dt = 1.0\nc = 0.1", {"c": [0.1, 0.1]}),
         (
             "[sweep]",

@@ -1,6 +1,7 @@
 """Recursive feasibility: every claim against exact polygons, closed forms or known answers."""
 
 import dataclasses
+import re
 import time
 from dataclasses import replace
 from fractions import Fraction
@@ -370,6 +371,7 @@ class TestReport:
         np.testing.assert_array_equal(report.loops.label, [0, 0])
         np.testing.assert_array_equal(report.loops.lost_at, [-1, -1])
         assert "time" in report.law.reason and report.seconds < 20
+        assert re.search(r"- feasible +0\n *- without a label +2\n", str(report))
         assert report.needed >= 32 and f"seconds needed       {report.needed} or more" in str(
             report
         )

@@ -89,7 +89,7 @@ class LimitsSection:
     h_x: Vector | None = None  # (r,)
     u_min: Limits  # (m,), -inf where free
     u_max: Limits  # (m,), inf where free
-    input_rate_limit: Limits | None = None  # (m,): |u_k - u_{k-1}| <= it, inf where free
+    input_rate_limit: Vector | None = None  # (m,): |u_k - u_{k-1}| <= input_rate_limit
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
