@@ -31,7 +31,6 @@ from jaxmpc.mpc.condense import condensed_bytes
 
 # Keys for which a number may stand, and how many entries the list has.
 NUMBERS = {
-    "system": {"c": "n"},
     "limits": {
         **dict.fromkeys(("x_min", "x_max"), "n"),
         **dict.fromkeys(("u_min", "u_max", "input_rate_limit"), "m"),
