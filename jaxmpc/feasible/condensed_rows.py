@@ -229,7 +229,9 @@ class RowPrograms:
         both = both * scaling(both[equal], np.zeros(equal.sum()))[1]
         both = both / np.maximum(np.linalg.norm(both, axis=1), 1e-300)[:, None]
         variables = both[:, : rows.U.shape[1]]
+        # Nor do rows of coordinates that are fixed, maybe on a limit of their own.
         self.equalities = equal & (_rank(variables[equal]) == _rank(both[equal]))
+        self.equalities |= ~both.any(axis=1)
         self._last: Program | None = None
         self._alone = threading.Lock()  # the last program is changed and solved as one
 

@@ -121,7 +121,11 @@ def framed(argument: str, G: np.ndarray, g: np.ndarray) -> Frame:
             flat(0.0)
     step, margin, _ = Program(G, slack).margin()
     moved, left = slack_at(center + step)
-    doubtful = margin <= _DOUBTFUL or left <= _ROUNDED
+    length = np.linalg.norm(G, axis=1)
+    depth = moved[length > 0] / length[length > 0]
+    # Of rows x <= 1 and -x <= 1e-16 both scales take a point at the second for inside.
+    uneven = len(depth) and depth.min() < 1e-9 * depth.max()
+    doubtful = uneven or margin <= _DOUBTFUL or left <= _ROUNDED
     if left > least or not doubtful:
         center, slack = center + step, moved
     if doubtful:

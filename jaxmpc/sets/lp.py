@@ -40,6 +40,8 @@ FLAT = 1e-9
 ROUNDING = 1e-11
 # What is left of G'y in a Farkas vector is charged for points so many times as far as typical ones.
 FAR = 1e3
+# Sides of rows that are smaller are zeros.
+UNDERFLOW = 1e-250
 _SWEEPS = 40  # of the least squares of `scaling`; fewer where they end before
 
 
@@ -335,7 +337,8 @@ def scaling(G: np.ndarray, g: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     factors.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
-        every, distance = np.log2(np.abs(G)), np.log2(np.abs(g))
+        # What is added against underflow, as to bounds of proofs, is no distance.
+        every, distance = np.log2(np.abs(G)), np.log2(np.where(np.abs(g) > UNDERFLOW, np.abs(g), 0))
         reach = np.where(np.isfinite(every), distance[:, None] - every, np.inf)
         reach[~np.isfinite(distance)] = np.inf
         L = np.where(_rounding_entries(every, distance, reach), -np.inf, every)

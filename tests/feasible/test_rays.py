@@ -68,3 +68,16 @@ def test_centre_keeps_a_margin_in_the_terminal_ellipsoid():
     found = jm.feasible.boundary(mpc, 12)
     beyond_box = np.maximum(np.abs(found.points) / 2 - 0.1, 0.0)
     np.testing.assert_allclose(np.linalg.norm(beyond_box, axis=1), 1.0, atol=1e-8)
+
+
+def test_slice_at_a_previous_input_on_its_limit():
+    """The row of u₋₁ alone has no margin then. Where rates do not bind, ends are those without."""
+    mpc = replace(problems.lecture(), inputs=jm.Box([0.0], [1.0]))
+    limited = replace(mpc, input_rate_limit=5.0)
+    center, directions = (
+        Rays.of(FeasibilityProblem.of(mpc)).center,
+        np.vstack([np.eye(2), -np.eye(2)]),
+    )
+    views = (mpc, None, None), (limited, (0, 1), [0.0, 0.0, 0.0])
+    ends = [Rays.of(FeasibilityProblem.of(*v), center).cast(directions).inner for v in views]
+    np.testing.assert_allclose(*ends, rtol=1e-9)

@@ -208,15 +208,15 @@ def test_derivative_in_float32():
         terminal_cost=np.diag([10.0, 1.0]),
         terminal_set=jm.Polytope(np.vstack([slanted, -slanted]), np.full(4, 0.1)),
     )  # fmt: skip
-    states = np.array([[0.5, 0.2], [1.0, 0.3], [0.3, -0.5], [0.6, 0.5]])
+    states = np.array([[0.47, 0.213], [1.03, 0.277], [0.31, -0.431], [0.57, 0.463]])
     exact = lambda v: jnp.asarray(np.asarray(v, np.float32), jnp.float64)
     jacobian = lambda solve: jax.jit(
         jax.vmap(jax.jacrev(lambda *of: solve(*of).inputs, argnums=1), (None, 0))
     )
     dense, staged = jacobian(jm.solve), jacobian(solve_stagewise)
     expected = dense(*jax.tree.map(exact, (mpc, states)))
-    with enable_x64(False):
-        found = np.asarray(staged(*jax.tree.map(np.float32, (mpc, states))))
+    found = np.asarray(staged(*jax.tree.map(np.float32, (mpc, states))))
+    assert found.dtype == np.float32
     scale = np.abs(expected).max(axis=(1, 2, 3), keepdims=True)
     np.testing.assert_allclose(found / scale, expected / scale, atol=1e-4)
 
@@ -420,6 +420,8 @@ def test_wrong_arguments_are_told_before_the_factorization(monkeypatch, given, m
 @pytest.mark.parametrize("fixed", [False, True])
 def test_plans_in_a_shard_map(limits, fixed):
     """Zeros that stand for rows of states, or for all rows, vary over the mesh as results do."""
+    if not (limits or fixed) and jax.__version_info__ < (0, 11):
+        pytest.skip("JAX 0.10 takes rows of which there are none for the same on all devices")
     system = jm.LinearSystem([[1, 0.1], [0, 1]], [0.005, 0.1])
     mpc = jm.MPC(system, [1.0, 0.5], 0.1, horizon=3, **limits)
     mesh, spec = jax.make_mesh((1,), ("b",), axis_types=(AxisType.Auto,)), PartitionSpec("b")

@@ -573,7 +573,7 @@ BAD_FILES = {
         "model: .* 1 activation states and the integrator RK4. Use another integrator",
     ),
     "integrator": (
-        single('integrator="implicit"'), {}, "model: MJX does not support it: .*IMPLICIT.*fast",
+        single('integrator="implicit"'), {}, "the integrator implicit, which MJX lacks.*fast",
     ),
     "forces": (
         single(actuator='<motor joint="a" ctrlrange="1 2" forcerange="-.5 .5"/>'), {},

@@ -568,3 +568,10 @@ def test_sums_of_many_vertices_by_few(n, rows):
     Q = Polytope.from_points(rng.standard_normal((n + 6, n)))
     d = rng.standard_normal((20, n))
     np.testing.assert_allclose((P + Q).support(d), P.support(d) + Q.support(d), rtol=1e-9)
+
+
+@pytest.mark.parametrize("least", [1e-10, 1e-13, 1e-30, 1e-290])
+def test_volume_of_a_box_that_begins_next_to_zero(least):
+    """[−1, 1]² × [−least, 1]: beside 1 the point inside must not lie within `least` of a side."""
+    H = np.vstack([np.eye(3), -np.eye(3)])
+    assert Polytope(H, np.append(np.ones(5), least)).volume() == pytest.approx(4.0, rel=1e-9)

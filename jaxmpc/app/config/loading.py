@@ -116,7 +116,8 @@ def _spread(document: Mapping[str, Any]) -> dict[str, Any]:
     if not isinstance(system, dict) or not isinstance(A, list | tuple):
         return found
     against = found.get("disturbance")
-    system["B"] = B = _column(B)
+    if B is not None:
+        system["B"] = B = _column(B)
     if isinstance(against, dict) and "E" in against:
         against["E"] = _column(against["E"])
     try:
