@@ -112,17 +112,17 @@ def framed(argument: str, G: np.ndarray, g: np.ndarray) -> Frame:
             "Check the rows: this needs a set with volume"
         )
 
+    norms = np.linalg.norm(G, axis=1)
     slack, least = slack_at(center)
     if least <= _ROUNDED:  # a scaled row, whose margin is this in its own units
-        inside, _ = largest_margin(G, g, np.linalg.norm(G, axis=1), 1.0)
+        inside, _ = largest_margin(G, g, norms, 1.0)
         center = center if inside is None else inside
         slack, least = slack_at(center)
         if least <= _ROUNDED:
             flat(0.0)
     step, margin, _ = Program(G, slack).margin()
     moved, left = slack_at(center + step)
-    length = np.linalg.norm(G, axis=1)
-    depth = moved[length > 0] / length[length > 0]
+    depth = moved[norms > 0] / norms[norms > 0]
     # Of rows x <= 1 and -x <= 1e-16 both scales take a point at the second for inside.
     uneven = len(depth) and depth.min() < 1e-9 * depth.max()
     doubtful = uneven or margin <= _DOUBTFUL or left <= _ROUNDED
