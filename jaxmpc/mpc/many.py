@@ -55,6 +55,7 @@ from jaxmpc.qp.admm import ADMM, DEFAULT, scaled_multipliers
 from jaxmpc.qp.dual import RIDGE, has_dual_steps, most_rows
 from jaxmpc.qp.jax_transformations import map_blocks, true_places
 from jaxmpc.qp.linalg import matmul, solve
+from jaxmpc.qp.residuals import NEAR
 from jaxmpc.qp.solve import from_multipliers
 from jaxmpc.qp.status import Status
 
@@ -435,12 +436,13 @@ def laws_of(controller: Controller, multipliers: Multipliers, status: Array) -> 
 
 
 def follow(controller: Controller, laws: Laws, cells: Cells, theta: Array) -> Plan:
-    """Return the plan from θ (p,) by the law of a solved state nearby: SOLVED, or ITERATION_LIMIT
-    where that does not hold, or there is none."""
+    """Return the plan from θ (p,) by the law of a solved state nearby: SOLVED where its residuals
+    are as small as those at which the solver ends, or ITERATION_LIMIT, also where there is no law.
+    """
     c, f = controller.condensed, controller.factor
     i = cells.nearest(theta)
     y = jnp.where(i < 0, jnp.nan, laws.evaluate(i, theta, len(f.E)))
     found, fault = from_multipliers(c.qp(theta), f, y)
     x0, previous = jnp.split(theta, [controller.mpc.system.n])
     aim = Aim(x0, previous_input=previous if controller.mpc.input_in_state else None)
-    return plan_of_solution(controller, theta, aim, found, fault)
+    return plan_of_solution(controller, theta, aim, found, fault, share=NEAR)

@@ -109,6 +109,16 @@ def test_own_residuals_decide(mpc, states, few, tolerance):
     assert np.all(found.gap[good] <= tolerance * np.maximum(found.cost[good], 1))
 
 
+def test_followed_plans_are_as_precise_as_solved_ones(mpc, states, few):
+    """The solver ends far below its tolerance, and so must what follows: a law that is nearly
+    right, as beside the border of its region, gives another plan within a loose tolerance."""
+    solver = jm.ADMM(eps=1e-2)
+    found = jm.solve_many(mpc, states, solver)
+    assert few[1][0] == 3  # some followed
+    expected = jm.solve_many(mpc, states, solver, transfer=False, chunk=64)
+    same_plans(found, expected, 1e-5)
+
+
 @pytest.mark.slow
 def test_a_wrong_law_is_no_plan(mpc, states, solved, few, monkeypatch):
     """Laws of other states: whatever they give, all plans are those of the solver."""
