@@ -519,11 +519,13 @@ def stated_terms(controller: Controller, y: Array, x: Array, u: Array, aim: Aim)
     products = products + jnp.sum(slope * row_terms)
     per_variable = 1 / jnp.sum(jnp.abs(factor.T), axis=1)
     # At a set-point tracking errors are zero, but not their rounding, which adds up over the steps
-    # whose terms cancel, as where inputs balance the weight.
-    size = jax.tree.map(jnp.abs, weights)
-    steps = jnp.cumsum(jnp.concatenate([jnp.abs(x[:1]), terms]), axis=0)
-    parts = size.of_states(steps).ravel(), size.of_inputs(jnp.abs(u)).ravel()
-    apart = matmul(jnp.concatenate(parts), 2 * jnp.abs(moved))
+    # whose terms cancel, as where inputs balance the weight: those of a step count at later ones.
+    size, Gamma, Omega = (jax.tree.map(jnp.abs, v) for v in (weights, c.Gamma, c.Omega))
+    of_states = jnp.concatenate([matmul(size.Q, Gamma[:-1]), matmul(size.P, Gamma[-1:])])
+    of_terms = jnp.cumsum(of_states[::-1], axis=0)[::-1]
+    each = jnp.concatenate([M.reshape(-1, M.shape[-1]) for M in (of_terms, matmul(size.R, Omega))])
+    made_of = [jnp.abs(x[0]), terms.ravel(), jnp.abs(u).ravel()]
+    apart = 2 * matmul(jnp.concatenate(made_of), each)
     return [
         (
             jnp.concatenate([*violations, defects.ravel()]),

@@ -154,7 +154,7 @@ def test_it_is_given_up_where_few_follow(mpc, states, solved, few, monkeypatch):
     monkeypatch.setattr(many, "TRIAL", 1)
     monkeypatch.setattr(many, "LEAST", 1.1)
     same_plans(jm.solve_many(mpc, states), solved)
-    assert [arguments for arguments, _ in few] == [1, 3, 1] and few[1][1] == 64
+    assert [arguments for arguments, _ in few] == [1, 3, 1] and few[1][1] == 512
 
 
 @pytest.mark.slow
