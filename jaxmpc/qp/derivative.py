@@ -208,7 +208,7 @@ def approximate(constants: tuple, own: tuple, b: tuple[Array, Array]) -> tuple[A
     The other instances of a batch take them with systems of the size of H.
     """
     (H, A, flat), (active, Lambda, turns) = constants, own
-    if turns or (min(A.shape) <= REDUCED_ROWS and not on_gpu()):
+    if turns or min(A.shape) <= (0 if on_gpu() else REDUCED_ROWS):
         return in_blocks(dense_steps, (H, A), (own, b), large=DENSE_BLOCK)
     most = KERNEL_ROWS if on_gpu() else REDUCED_ROWS
     W, S = true_places(active, most), matmul(A, A.T)

@@ -54,6 +54,8 @@ LENGTHS = (1.0, 0.5, 0.25, 0.0625)
 RIDGE = 1e-11
 # Violations relative to the largest row that count as rounding.
 NOISE = 1e-13
+# Difference of losses, relative to these, that counts as none.
+TIE = 1e-13
 # Distance from the optimum at which the steps end that is rounding of the largest multiplier.
 ROUNDING = 1e-15
 # Most steps, and most of a second search.
@@ -150,7 +152,8 @@ def dual_step(dual: Dual, point: DualPoint, singly: Array, most: int) -> tuple[D
     moved = jax.vmap(lambda t: rows.moved(t * d))(t)
     loss = jnp.sum(jax.vmap(rows.loss)(moved, matmul(moved, S_W)), axis=1)
     # (An argmin in a float64 program cannot be lowered where 64-bit mode is off.)
-    best = (loss <= jnp.min(loss)).astype(y.dtype)
+    least = jnp.min(loss)
+    best = (loss <= least + TIE * jnp.abs(least)).astype(y.dtype)
     change = jnp.zeros_like(y).at[W].add(matmul(best / jnp.sum(best), moved), mode="drop")
     return point.moved(dual.A, change), jnp.sum(in_W) <= most
 
@@ -160,7 +163,8 @@ def working_set(bounds: Bounds, y: Array, v: Array, singly: Array) -> Array:
     than rounding, where they join singly only the one that is so most."""
     outside, noise = bounds.outside(v), NOISE * (1 + infinity_norm(v))
     new = jnp.where(y == 0, jnp.abs(outside), 0.0)
-    least = jnp.where(singly, jnp.max(new, initial=0.0), 0.0)
+    # Less rounding: a compiler may compute `outside` again, with other rounding, where it is used.
+    least = jnp.where(singly, jnp.max(new, initial=0.0) - noise, 0.0)
     in_W = (y != 0) | ((jnp.abs(outside) > noise) & (jnp.abs(outside) >= least))
     if bounds.linear is not None:
         # An L1 penalty that is paid in full stays so while its row is outside.

@@ -200,8 +200,10 @@ def called_jaxpr(eqn: Any) -> ClosedJaxpr | None:
 
 
 def with_derivative_of(slow: Callable[..., R], fast: Callable[..., R]) -> Callable[..., R]:
-    """Return `fast`, which computes what `slow` does, with the derivative of `slow`."""
-    found = jax.custom_jvp(fast)
+    """Return `fast`, which computes what `slow` does, with the derivative of `slow`; arguments that
+    only `fast` has keep their defaults."""
+    # (The rule below is given the defaults of what it is a rule of, too.)
+    found = jax.custom_jvp(lambda *args: fast(*args))
     # The value is that of `fast` here too: under `vmap` within `jit` JAX takes the place of the
     # batch axis from the function as it stands, and `slow` might put it elsewhere.
 

@@ -210,7 +210,13 @@ class _Lines:
 
     def while_(self, params: dict, given: list[str]) -> list[str]:
         enter, body = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
-        state = [self.new(text) for text in given[body:]]
+        # Triton takes a variable of a loop for constant if the loop's text, run once, gives it the
+        # very value that it had, as t, previous = f(t), t does where both begin with the same.
+        begin, copy = given[body:], "tl.where(tl.full([], True, tl.int1), {0}, {0})"
+        state = [
+            self.new(copy.format(text) if text in begin[:k] else text)
+            for k, text in enumerate(begin)
+        ]
         [go] = self.jaxpr(params["cond_jaxpr"], [*given[:enter], *state])
         go = self.new(go)
         self.add(f"while {go}:")
