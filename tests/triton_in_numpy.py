@@ -85,8 +85,25 @@ def language(number):
     )
 
 
+def require_apart(text):
+    """Fail where two variables of a loop begin as the same variable: Triton takes one of them for
+    constant if the loop's text, run once, gives it the value that it had."""
+    begins, loops = {}, []
+    for line in text.splitlines():
+        depth, (names, _, values) = len(line) - len(line.lstrip()), line.strip().partition(" = ")
+        if line.lstrip().startswith("while "):
+            loops.append(depth)
+        elif values and loops and depth > loops[-1] and "," in names:
+            found = [begins.get(name) for name in names.split(", ")]
+            copies = [value for value in found if value in begins]
+            assert len(set(copies)) == len(copies), (line, copies)
+        elif values:
+            begins.setdefault(names, values)
+
+
 def run(text, kernel, args, batch):
     """Return the results of the text of a kernel for these arguments."""
+    require_apart(text)
     head = "import triton\nimport triton.language as tl\n"
     assert text.startswith(head)
     space = {"triton": SimpleNamespace(jit=lambda function: function)}

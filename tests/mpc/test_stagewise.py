@@ -420,8 +420,6 @@ def test_wrong_arguments_are_told_before_the_factorization(monkeypatch, given, m
 @pytest.mark.parametrize("fixed", [False, True])
 def test_plans_in_a_shard_map(limits, fixed):
     """Zeros that stand for rows of states, or for all rows, vary over the mesh as results do."""
-    if not (limits or fixed) and jax.__version_info__ < (0, 11):
-        pytest.skip("JAX 0.10 takes rows of which there are none for the same on all devices")
     system = jm.LinearSystem([[1, 0.1], [0, 1]], [0.005, 0.1])
     mpc = jm.MPC(system, [1.0, 0.5], 0.1, horizon=3, **limits)
     mesh, spec = jax.make_mesh((1,), ("b",), axis_types=(AxisType.Auto,)), PartitionSpec("b")

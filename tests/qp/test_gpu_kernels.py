@@ -16,6 +16,7 @@ import triton_in_numpy
 from bench.families import joint
 
 import jaxmpc as jm
+from jaxmpc.mpc import solve_stagewise
 from jaxmpc.mpc.stagewise import recursion_kernels
 from jaxmpc.qp import admm, derivative, dual, jax_transformations, kernel, newton, solve
 from jaxmpc.qp.admm import ADMM, ScaledProgram, factorise, iterate, splittings
@@ -325,6 +326,23 @@ def test_texts_of_kernels_compute_what_the_kernels_do(calls, names, texts, monke
     monkeypatch.setattr(newton, "has_kernels", lambda rows: True)
     calls()
     assert set(texts) == names
+
+
+def test_derivatives_of_plans_without_rows_on_a_gpu(monkeypatch, x64):
+    """There are no rows to gather."""
+    monkeypatch.setattr(derivative, "on_gpu", lambda: True)
+    controller = jm.Controller(jm.MPC(joint().system, np.eye(2), np.eye(1), 2), SOLVER)
+    plans = jax.vmap(lambda x: controller(x).u)
+    assert jax.eval_shape(jax.jacrev(plans), jnp.ones((3, 2))).shape == (3, 1, 3, 2)
+
+
+def test_derivatives_in_the_model_of_plans_stage_by_stage_on_a_gpu(monkeypatch, x64):
+    """The scale of the rows depends on the model by a recursion, too."""
+    monkeypatch.setattr(recursion_kernels, "on_gpu", lambda: True)
+    mpc = replace(joint(), horizon=3)
+    of = lambda B: replace(mpc, system=replace(mpc.system, B=B))
+    cost = lambda B: solve_stagewise(of(B), np.ones(2), solver=SOLVER).cost
+    assert jax.eval_shape(jax.grad(cost), np.array(mpc.system.B)).shape == (2, 1)
 
 
 def test_a_kernel_of_batches_of_batches(texts):
