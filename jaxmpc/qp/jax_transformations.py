@@ -488,7 +488,8 @@ def _in_groups(
 
     def while_more(least: Any, advance: Callable[[S], S], state: S, real: Any = True) -> S:
         more = lambda state: jnp.sum(open_ones(state) & real) > least
-        return lax.while_loop(more, advance, state)
+        # (Arrays without entries old versions of JAX take for constants.)
+        return lax.while_loop(more, lambda state: varying(advance(state), state), state)
 
     def advance_group(count: int, least: int, state: S) -> S:
         """Return the states after steps of the first `count` open instances side by side: until no

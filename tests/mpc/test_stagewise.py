@@ -417,9 +417,11 @@ def test_wrong_arguments_are_told_before_the_factorization(monkeypatch, given, m
 
 
 @pytest.mark.parametrize("limits", [{}, {"inputs": jm.Box(-1, 1)}])
-@pytest.mark.parametrize("fixed", [False, True])
-def test_plans_in_a_shard_map(limits, fixed):
-    """Zeros that stand for rows of states, or for all rows, vary over the mesh as results do."""
+@pytest.mark.parametrize(("fixed", "backend"), [(False, "cpu"), (False, "gpu"), (True, "cpu")])
+def test_plans_in_a_shard_map(limits, fixed, backend, monkeypatch):
+    """Zeros that stand for rows of states, or for all rows, vary over the mesh as results do; also
+    in the groups of a GPU."""
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
     system = jm.LinearSystem([[1, 0.1], [0, 1]], [0.005, 0.1])
     mpc = jm.MPC(system, [1.0, 0.5], 0.1, horizon=3, **limits)
     mesh, spec = jax.make_mesh((1,), ("b",), axis_types=(AxisType.Auto,)), PartitionSpec("b")
