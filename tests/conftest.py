@@ -69,6 +69,14 @@ def pytest_collection_modifyitems(items):
             item.add_marker("slow")
 
 
+def pytest_runtest_setup(item):
+    if item.get_closest_marker("cpu"):
+        import jax
+
+        if jax.default_backend() != "cpu":
+            pytest.skip("about CPUs")
+
+
 @pytest.fixture(scope="module", autouse=True)
 def _forget_programs():
     """Before the process has too many memory maps. What is needed again comes from the cache."""

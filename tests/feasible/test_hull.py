@@ -136,7 +136,7 @@ def test_a_problem_keeps_its_cones(monkeypatch):
 
 def test_labels_and_bounds_share_their_rays(monkeypatch):
     """Rays are sent once for the labels, and not again for bounds that are no closer."""
-    monkeypatch.setattr(hull_labels, "MANY", 500)
+    monkeypatch.setattr(hull_labels, "MANY", 60)
     problem = FeasibilityProblem.of(problems.lecture())
     mapped = jm.map_feasible_set(problem, points_of("lecture", 600))
     monkeypatch.setattr(rays, "close_gap", lambda *_, **__: pytest.fail("sent again"))

@@ -639,6 +639,7 @@ def test_a_float64_controller_outside_64_bit_mode_is_refused():
         assert controller(np.zeros(2)).u.dtype == np.float64
 
 
+@pytest.mark.cpu
 @pytest.mark.parametrize("call", [jm.solve, jm.solve_many, jm.Controller])
 def test_dense_problems_that_take_long_or_do_not_fit_are_told_before_any_compile(monkeypatch, call):
     """1,200 steps of two states and an input, with limits of all: 1,200 variables, 3,600 rows."""

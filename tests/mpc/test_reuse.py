@@ -11,6 +11,7 @@ from jaxmpc.mpc.condense import in_float64
 from jaxmpc.mpc.controller import Controller
 
 COUNT = 1024
+pytestmark = pytest.mark.cpu
 
 
 @pytest.fixture

@@ -108,6 +108,7 @@ def test_an_indefinite_matrix_is_nan_alone(n):
         assert bad == [False, True, False, False]
 
 
+@pytest.mark.cpu
 @pytest.mark.parametrize("n", [40, 130])
 def test_openblas_gets_parts_that_one_thread_works_off(n):
     """Its threads wait for each other. Values, and NaN where a matrix is indefinite alone."""

@@ -79,6 +79,7 @@ def as_a_whole(factor, n):
     return factor * n, jnp.int32(0)
 
 
+@pytest.mark.cpu
 @pytest.mark.parametrize("shared", [True, False])
 @pytest.mark.parametrize("count", [1, 5, 300])
 def test_an_attempt_goes_first(count, shared):
@@ -94,6 +95,7 @@ def test_an_attempt_goes_first(count, shared):
     np.testing.assert_array_equal(jax.jit(jax.grad(total))(factor), jnp.sum(n) if shared else n)
 
 
+@pytest.mark.cpu
 @pytest.mark.parametrize("count", [5, 300])
 def test_an_attempt_in_a_shard_map(count):
     """What is the same for all instances varies over the mesh, where others do."""
@@ -128,6 +130,7 @@ def test_what_fills_up_groups_is_not_one_instance_that_takes_long(left):
     assert all(1 <= solved.count(n) <= most for n in left)
 
 
+@pytest.mark.cpu
 @pytest.mark.parametrize("axes", [(None, 0), (0, 0), (0, None)])
 def test_an_attempt_of_nested_batches(axes):
     n, factors = jnp.arange(2.0 * BLOCK).reshape(2, BLOCK), jnp.array([3.0, 5.0])

@@ -455,6 +455,7 @@ def assert_gradient(modes):
         assert np.abs(found[2][1]) > 1e-4
 
 
+@pytest.mark.cpu
 def test_in_pieces_changes_nothing(monkeypatch):
     """As on the old jaxlibs: values, vmap, jit, forward mode, conditionals, constants."""
     monkeypatch.setattr(jaxpr_rewriting, "JAXLIB", (0, 10, 2))
