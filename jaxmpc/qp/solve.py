@@ -120,10 +120,40 @@ def _solve(
 ) -> QPSolution:
     """`solve_qp`. linear: known to have P = 0, so that there are no steps on the dual."""
     made = factorise(qp.P, qp.A, solver, qp.balls)
-    given = qp, made, solver, warm_start
+    unit = unit_of_cost(qp, made)
+    if warm_start is not None:
+        z, y = require_warm_start(qp, warm_start)
+        warm_start = z, jnp.asarray(y) / unit
+    given = with_cost_divided(qp, unit), made, solver, warm_start
     if whole and not linear and can_attempt(solver, qp.balls, qp.A):
-        return with_fault(*attempted_first(_attempt, _solve_whole, _derived, *given))
-    return with_fault(*solve_factored(*given, whole=whole))
+        found, fault = attempted_first(_attempt, _solve_whole, _derived, *given)
+    else:
+        found, fault = solve_factored(*given, whole=whole)
+    y, cost, dual, gap = (v * unit for v in (found.y, found.cost, found.dual_residual, found.gap))
+    return with_fault(replace(found, y=y, cost=cost, dual_residual=dual, gap=gap), fault)
+
+
+def unit_of_cost(qp: QP, factor: Factor) -> Array:
+    """Return the unit of the cost: 1, and where P = 0, which leaves it free beside that of the
+    limits, the power of two that makes q, in ADMM's coordinates, 2^10 times the mean finite limit.
+
+    The mean is that of logarithms, so that neither limits that are far off nor rounding in place of
+    0 decide it. Proximal steps are as long as q: with 2^-5 in place of 2^10 some end short of the
+    limits (4 of 480 random programs), with 2^20 none do."""
+    q, bounds = infinity_norm(matmul(qp.q, factor.T)), qp.bounds.scaled(factor.E)
+    ends = jnp.abs(jnp.stack([bounds.l, bounds.u]))
+    count = (ends > 0) & (ends < jnp.inf)
+    mean = jnp.sum(jnp.log2(jnp.where(count, ends, 1.0))) / jnp.maximum(jnp.sum(count), 1)
+    exponent = jnp.round(jnp.log2(q) - mean) - 10
+    use = jnp.all(qp.P == 0) & jnp.any(count) & jnp.isfinite(exponent)
+    exponent = jax.lax.stop_gradient(jnp.where(use, exponent, 0.0))
+    return jnp.ldexp(jnp.ones((), qp.q.dtype), exponent.astype(jnp.int32))
+
+
+def with_cost_divided(qp: QP, unit: Array) -> QP:
+    """Return the program with P = 0 whose cost is that of `qp`, divided by `unit`."""
+    weights = {name: getattr(qp, name) for name in ("q", "soft_linear", "soft_quadratic")}
+    return replace(qp, **{name: v / unit for name, v in weights.items() if v is not None})
 
 
 def can_attempt(solver: ADMM, balls: tuple[int, ...], A: Array) -> bool:

@@ -187,6 +187,22 @@ def test_answer_in_any_units(x64):
     assert faults(2, 2, x64) == []
 
 
+@PRECISIONS
+def test_linear_program_with_cost_and_limits_in_units_far_apart(x64):
+    """With q times c and limits times s the answer is s z and its multipliers are c y."""
+    rng, dtype = np.random.default_rng(4), np.float64 if x64 else np.float32
+    factors = (2.0**-40, 2.0**-20, 1.0, 2.0**20, 2.0**40)
+    units = np.array([(c, s) for c in factors for s in factors])
+    qp, known = program(rng, "linear")
+    each = [replace(qp, q=c * qp.q, l=s * qp.l, u=s * qp.u) for c, s in units]
+    with jax.enable_x64(x64):
+        found = solutions(each, dtype)
+    assert (found.status == jm.Status.SOLVED).all()
+    np.testing.assert_allclose(found.z / units[:, 1:], [known] * len(each), rtol=2e-5)
+    gradient = found.y / units[:, :1] @ qp.A + qp.q
+    np.testing.assert_allclose(gradient, 0 * gradient, atol=2e-5)
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
 @PRECISIONS
