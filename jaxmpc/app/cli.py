@@ -73,6 +73,9 @@ def main(
     session: entered once the options are known to be right, before JAX is imported.
     """
     argv = list(sys.argv[1:] if argv is None else argv)
+    for name in ("stdout", "stderr"):  # None where the shell has closed it, as by >&-
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))
     for stream in (sys.stdout, sys.stderr):  # what their encoding lacks becomes "?"
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
@@ -104,7 +107,10 @@ def main(
     if everywhere.json:
         found = as_json(options, outcome, said.getvalue(), begun)
         name = " ".join(words[: 2 if words[0] == "tune" else 1])
-        print(json.dumps({"command": name} | found, indent=2))
+        try:
+            print(json.dumps({"command": name} | found, indent=2), flush=True)
+        except BrokenPipeError:
+            return without_reader()
     return outcome.code
 
 

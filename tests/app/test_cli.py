@@ -617,7 +617,7 @@ def test_verify_a_recursion_report(tmp_path, capsys):
     assert "cannot be read" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("words", [["sweep", "--help"], ["init"]])
+@pytest.mark.parametrize("words", [["sweep", "--help"], ["init"], ["init", "--json"]])
 def test_a_reader_that_has_ended_ends_a_command_silently(words, tmp_path):
     """As in `jaxmpc sweep --help | head -1`."""
     with subprocess.Popen(
@@ -628,3 +628,10 @@ def test_a_reader_that_has_ended_ends_a_command_silently(words, tmp_path):
         process.stdout.close()
         error = process.stderr.read()
     assert (process.returncode, error) == (141, "")
+
+
+def test_closed_streams_are_no_errors(tmp_path):
+    """As in `jaxmpc init >&- 2>&-`."""
+    command = f"{sys.executable} -m jaxmpc init >&- 2>&-"
+    assert subprocess.run(command, shell=True, cwd=tmp_path, check=False).returncode == 0
+    assert (tmp_path / "problem.toml").is_file()
