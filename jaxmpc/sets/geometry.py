@@ -131,7 +131,7 @@ def framed(argument: str, G: np.ndarray, g: np.ndarray) -> Frame:
     if doubtful:
         low, high = Program(G, slack).bounds()
         half = (high - low) / 2
-        if np.any(half <= 0):
+        if np.any(half <= np.sqrt(np.finfo(float).tiny)):  # whose squares are 0
             flat(0.0)
         unit = np.where(np.isfinite(half), half, Program(G, slack).column)
         # (The margin of `Program` is one of scaled rows, which have units of their own.)

@@ -149,6 +149,12 @@ def test_scattered_points_slice_and_projection(tmp_path):
     assert (tmp_path / "map.png").stat().st_size > 1000
 
 
+def test_a_map_without_points_shows_its_bounds():
+    ax = plot_feasible_set(Map(np.zeros((0, 2))))
+    assert not any(word.startswith(("feasible", "infeasible")) for word in texts(ax))
+    assert any("bound" in word for word in texts(ax))
+
+
 def test_only_two_states():
     with pytest.raises(ValueError, match="fmap: maps 3 states.*Choose|choose `axes`"):
         plot_feasible_set(Map(np.zeros((5, 3))))

@@ -575,3 +575,10 @@ def test_volume_of_a_box_that_begins_next_to_zero(least):
     """[−1, 1]² × [−least, 1]: beside 1 the point inside must not lie within `least` of a side."""
     H = np.vstack([np.eye(3), -np.eye(3)])
     assert Polytope(H, np.append(np.ones(5), least)).volume() == pytest.approx(4.0, rel=1e-9)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_set_of_a_size_whose_square_vanishes_is_flat():
+    """What is left of a point after rounding: it was divided by lengths that are 0."""
+    with pytest.raises(ValueError, match="is flat"):
+        Polytope(SQUARE.H, 1e-291 * np.ones(4)).frame("set")

@@ -434,7 +434,7 @@ def draw_values(ax: Axes, points: np.ndarray, value: np.ndarray, colours: dict[i
             interpolation="nearest",
         )
         return
-    size = float(np.clip(2e4 / len(points), 1.0, 30.0))
+    size = float(np.clip(2e4 / max(len(points), 1), 1.0, 30.0))
     for key, colour in colours.items():
         x, y = points[value == key].T
         ax.scatter(x, y, s=size, color=colour, linewidths=0)
