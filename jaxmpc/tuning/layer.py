@@ -17,7 +17,7 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.arrays import Reals, host_array
-from jaxmpc.checks import concrete, fail, require_kind
+from jaxmpc.checks import concrete, fail, require_kind, require_shape
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.plan import Control, Plan
 from jaxmpc.mpc.problem import MPC
@@ -121,6 +121,9 @@ class MPCLayer:
         if set(theta) != set(self.parameters):
             given, needed = ", ".join(theta), ", ".join(self.parameters)
             fail("theta", f"has the names {given or 'none'}", f"Needed: {needed}, as from init()")
+        for name, parameter in self.parameters.items():
+            shape = parameter.raw().shape
+            require_shape(f"theta[{name!r}]", theta[name], shape, "Give θ as from init()")
         found = values(self.parameters, theta)
         mpc = reduce(lambda mpc, name: _with(mpc, _path(name), found[name]), found, self.mpc)
         if self.terminal_weight == "lqr":

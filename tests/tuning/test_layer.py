@@ -207,6 +207,10 @@ def test_refuses(learn, words):
 def test_refuses_other_parameters(layer):
     with pytest.raises(ValueError, match="theta: has the names Q"):
         layer({"Q": jnp.zeros(3)}, np.zeros(2))
+    theta = layer.init()
+    name = next(iter(theta))
+    with pytest.raises(ValueError, match=rf"theta\['{name}'\]: shape \(9,\)"):
+        jax.jit(layer)({**theta, name: jnp.zeros(9)}, np.zeros(2))
     with pytest.raises(ValueError, match="holds traced arrays"):
         jax.jit(lambda Q: jm.tuning.MPCLayer(jm.MPC(MPC.system, Q, np.eye(1), 3)).init())(np.eye(2))
 
