@@ -30,6 +30,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import DTypeLike
 
 from jaxmpc.checks import MOST_COUNT, concrete, fail, number, require_real, whole
 from jaxmpc.pytrees import pytree, static
@@ -194,10 +195,10 @@ def scale(
     """Coordinates z = T w and row scale E with T'PT ≈ I and rows of E A T of length one.
 
     Variables first get units of their own (`units`); then T is the inverse transposed Cholesky
-    factor of P + δI. T'PT stays exact. curvature (n,): added to P's diagonal for T, for variables
+    factor of P + δI. curvature (n,): added to P's diagonal for T, for variables
     without a cost of which more is known than P and A say; None: of none.
-    Returns T, E, T'PT, E A T and whether P is singular. A zero row keeps scale 0: it constrains
-    nothing in z. The rows of a ball share one scale, so that it stays one.
+    Returns T, E, H = T'PT (see `hessian`), E A T and whether P is singular. A zero row keeps scale
+    0: it constrains nothing in z. The rows of a ball share one scale, so that it stays one.
     """
     n, dtype = P.shape[0], P.dtype
     metric = P if curvature is None else P + jnp.diag(curvature)
@@ -206,7 +207,7 @@ def scale(
     delta, flat = null_curvature(*jax.lax.stop_gradient((P_1, A_1)))
     flat = flat if curvature is None else flat | jnp.any(curvature > 0)
     T = unit[:, None] * inverse_root(P_1 + delta * jnp.eye(n, dtype=dtype)).T
-    H = matmul(T.T, matmul(P, T))
+    H = hessian(P, T, dtype)
     rows = matmul(A, T)
     squared = jnp.sum(rows**2, axis=1)
     # A row is zero when it is rounding noise of its own terms. Other rows have other units.
@@ -220,6 +221,22 @@ def scale(
     zero = squared <= noise
     E = jnp.where(zero, 0.0, 1 / jnp.sqrt(jnp.where(zero, 1.0, squared)))
     return T, E, (H + H.T) / 2, E[:, None] * rows, flat
+
+
+def hessian(P: Array, T: Array, dtype: DTypeLike) -> Array:
+    """Return H = T'PT (n, n) for P (n, n) that has been rounded to a type, with a share ν of the
+    identity in it that makes up for this: (1 − ν)T'PT + νI.
+
+    Rounded, a singular P has curvature of either sign in its null space, where T magnifies it.
+    Errors of ε|P_ij| in the entries of P, of independent signs, make one in H whose norm is at
+    most ν = ε(Σ_ij |T_i|²P_ij²|T_j|²)^½ in the root mean square, T_i the rows of T. In directions
+    in which T'PT is the identity nothing changes.
+    """
+    H = matmul(T.T, matmul(P, T))
+    length = jnp.linalg.norm(jax.lax.stop_gradient(T), axis=1)
+    noise = jnp.linalg.norm(jax.lax.stop_gradient(P) * length * length[:, None])
+    share = jnp.minimum(float(jnp.finfo(dtype).eps) * noise, 1.0)
+    return H + share * (jnp.eye(len(H), dtype=H.dtype) - H)
 
 
 def units(curvature: Array, A: Array) -> Array:
@@ -413,8 +430,8 @@ class ScaledProgram:
         units: what rounding to float32 leaves between the two is more than the last Newton steps
         gain."""
         qp, f = self.qp, self.factor
-        A = f.E[:, None] * matmul(qp.A, f.T)
-        f = replace(f, H=matmul(f.T.T, matmul(qp.P, f.T)), A=A, S=matmul(A, A.T))
+        A, H = f.E[:, None] * matmul(qp.A, f.T), hessian(qp.P, f.T, jnp.float32)
+        f = replace(f, H=H, A=A, S=matmul(A, A.T))
         return ScaledProgram.of(qp, f, self.eps, self.unit)
 
     def scaled_rows(self, z: Array, y: Array) -> tuple[Array, Array]:

@@ -61,6 +61,8 @@ from jaxmpc.qp.residuals import (
 # Steps of the line search, a scalar Newton method. Penalties put almost vertical pieces into the
 # derivative, which only bisection finds.
 LINE_STEPS, LINE_STEPS_SOFT = 6, 24
+# First proximal weight of the method of multipliers.
+SIGMA = 1.0
 # Steps without gain after which a pair within the tolerance is not made better any more.
 IDLE = 40
 
@@ -273,7 +275,7 @@ class MultiplierState:
 def multipliers_start(q: Array, w: Array, y: Array) -> MultiplierState:
     """Return the state of the method of multipliers at (w, y)."""
     none_y, none_w = jnp.zeros_like(y), jnp.zeros_like(w)
-    first = (Constants.of(w.dtype).rho[0], 1.0, jnp.inf)
+    first = (Constants.of(w.dtype).rho[0], SIGMA, jnp.inf)
     rho, sigma, before = (jnp.asarray(v, w.dtype) for v in first)
     tolerance = 0.1 * (infinity_norm(q) + infinity_norm(y))
     return MultiplierState(w, y, none_y, none_w, rho, sigma, before, tolerance)
@@ -352,18 +354,20 @@ class Refinement:
 
 
 class RefinementData(NamedTuple):
-    """What the steps need: the program, H² (n, n), and `correcting_rows`."""
+    """What the steps need: the program, H² (n, n), `correcting_rows`, and whether P, which is not
+    0, has been rounded to float32."""
 
     program: ScaledProgram
     squared: Array
     correcting: tuple[Array, Array]
+    rounded: Array
 
 
 def improve(
-    most: int, fixed: bool, whole: bool, p: ScaledProgram, begin: MultiplierState
+    most: int, fixed: bool, whole: bool, single: bool, p: ScaledProgram, begin: MultiplierState
 ) -> tuple[Pair, Proof, Array, Array]:
     """Improve the point of ADMM by `most` Newton steps at most, in float64. fixed: every instance
-    takes them all. whole: with the method of multipliers.
+    takes them all. whole: with the method of multipliers. single: the data were float32.
 
     The method of multipliers takes what steps on the dual do not solve: P singular, balls,
     degenerate or infeasible rows.
@@ -385,7 +389,8 @@ def improve(
         begin = least_violation(begin, empty)
     if not whole:
         return best, Proof.none(p.q, p.bounds.l), best.finished, false
-    given, none = RefinementData(p, matmul(f.H, f.H), correcting), jnp.int32(0)
+    rounded, none = jnp.any(f.H != 0) & single, jnp.int32(0)
+    given = RefinementData(p, matmul(f.H, f.H), correcting, rounded)
     s = Refinement(
         point=begin,
         bounds=p.bounds,
@@ -471,6 +476,10 @@ def _minimised(
         hard = replace(hard, linear=linear, quadratic=quadratic)
         cone = replace(cone, linear=linear, quadratic=quadratic)
     damping, y, q = Constants.of(s.w.dtype).damping, jnp.zeros_like(s.point.y), s.q
+    # In float32 what ADMM says of directions without curvature that no active row stops is rounding
+    # of P divided by a ridge: until φ is minimised first, its proximal term is centred at 0.
+    centred = H + s.point.sigma * (jnp.eye(len(H), dtype=H.dtype) - H)
+    H = jnp.where(given.rounded & (s.point.sigma == SIGMA), centred, H)
     multipliers = Augmented(s.point.y, H, q, s.bounds, s.point.rho, s.point.sigma)
     to_rows = Augmented(y, 0 * H, 0 * q, hard, 1.0, damping)
     to_ray = Augmented(y, H_ray, q_ray, cone, 1.0, damping)

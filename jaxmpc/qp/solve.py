@@ -290,8 +290,9 @@ def loop_kernel(
 
 def refined_end(p: ScaledProgram, solver: ADMM, begin: MultiplierState, whole: bool) -> QPSolution:
     """Return the solution by Newton steps in float64 (`newton.py`)."""
-    single, settings = p.q.dtype != jnp.float64, (solver.most_newton_steps(), solver.fixed, whole)
-    improved = lambda p, begin: improve(*settings, p.unrounded() if single else p, begin)
+    single, most = p.q.dtype != jnp.float64, solver.most_newton_steps()
+    steps = partial(improve, most, solver.fixed, whole, single)
+    improved = lambda p, begin: steps(p.unrounded() if single else p, begin)
     pair, proof, ended, idle = precisely(improved, p, begin)
     found = with_status(pair.measured, pair.z, pair.y, proof)
     unsolved = found.status == Status.ITERATION_LIMIT

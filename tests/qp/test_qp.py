@@ -555,6 +555,56 @@ class TestFloat32:
         assert feasible.sum() > 80
         assert (found.status == known.status)[feasible].all()
 
+    many = staticmethod(jax.jit(jax.vmap(jm.solve_qp)))
+
+    def solved(self, programs):
+        """Solutions of programs of one shape, rounded to float32, in float64 arrays."""
+        qp = jax.tree.map(lambda *v: np.stack(v).astype(np.float32), *programs)
+        return qp, jax.tree.map(lambda v: np.asarray(v, float), self.many(qp))
+
+    def test_rounded_hessian_of_half_rank(self):
+        """Rounded, P has curvature of either sign where it had none and where rows lie. Nearly all
+        programs have a solution within the tolerance even so; what is found is one to rounding."""
+        rng, n, rank, count = np.random.default_rng(3), 16, 8, 40
+        programs = []
+        for _ in range(count):
+            V = np.linalg.qr(rng.standard_normal((n, n)))[0]
+            factor = V[:, :rank] @ rng.standard_normal((rank, rank))
+            A, z = rng.standard_normal((20, n - rank)) @ V[:, rank:].T, rng.standard_normal(n)
+            push, value = (np.arange(20) < 6) * rng.uniform(0.1, 3, 20), A @ z
+            u, P = value + (push == 0) * rng.uniform(0.2, 2, 20), factor @ factor.T
+            programs.append(jm.QP(P, -P @ z - A.T @ push, A, value - 5.0, u))
+        qp, found = self.solved(programs)
+        assert np.mean(found.status == jm.Status.SOLVED) >= 0.95
+        assert np.isin(found.status, [jm.Status.SOLVED, jm.Status.INACCURATE]).all()
+        P, q, A, l, u = (np.asarray(v, float) for v in (qp.P, qp.q, qp.A, qp.l, qp.u))
+        times = lambda M, v: (M @ v[..., None])[..., 0]
+        z, y, columns = found.z, found.y, A.swapaxes(1, 2)
+        beyond = times(A, z) - np.clip(times(A, z), l, u)
+        gradient = times(P, z) + q + times(columns, y)
+        of_rows = times(abs(A), abs(z)) + np.maximum(abs(l), abs(u))
+        terms = times(abs(P), abs(z)) + abs(q) + times(abs(columns), abs(y))
+        assert np.all(abs(beyond) <= 1e-5 * of_rows) and np.all(abs(gradient) <= 1e-5 * terms)
+        # Of a row that is not met there is no multiplier: with this the conditions are complete.
+        slack = np.where(y > 0, u - times(A, z), times(A, z) - l)
+        assert np.all(abs(y) * np.maximum(slack, 0) <= 1e-5 * of_rows * (1 + abs(y)))
+
+    def test_units_of_a_linear_cost(self):
+        """The vertex of a linear program is where it is, whatever the size of its cost beside that
+        of its limits: 16 rows meet there, and push."""
+        rng, n = np.random.default_rng(4), 16
+        programs, vertices = [], []
+        for far, near in np.repeat([[1e-4, 1e4], [1e8, 1.0], [1.0, 1e8], [1.0, 1.0]], 10, axis=0):
+            A, z = rng.standard_normal((20, n)), far * rng.standard_normal(n)
+            push, value = (np.arange(20) < n) * rng.uniform(0.1, 3, 20), A @ z
+            u = value + far * (push == 0) * rng.uniform(0.2, 2, 20)
+            programs.append(jm.QP(np.zeros((n, n)), -near * A.T @ push, A, value - 9 * far, u))
+            vertices.append(np.linalg.solve(*(v[:n] for v in map(np.float32, (A, u)))))
+        _, found = self.solved(programs)
+        assert (found.status == jm.Status.SOLVED).all()
+        off = np.max(abs(found.z - vertices), axis=1) / np.max(abs(np.array(vertices)), axis=1)
+        assert np.all(off <= 1e-4)
+
 
 def badly_scaled(n, rng):
     """A linear program in z ≥ 0 with n sparse rows and one of its solutions."""
