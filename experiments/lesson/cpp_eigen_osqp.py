@@ -42,6 +42,9 @@ def build_joint_mpc_qp(controller: jm.Controller, x0: np.ndarray) -> independent
 def run(s: Settings) -> dict[str, np.ndarray]:
     """Drive the loop with OSQP's torque; compare matrices and torques at each sample."""
     controller = jm.Controller(joint(s.horizon))
+    # l and u are limits less what the state contributes. At a limit, and OSQP's torques lead there
+    # to within 1e-11, nothing else says how large a violation is: speed at k = 0 has no torque.
+    sizes = np.concatenate([np.tile(TAU_MAX, s.horizon), np.tile(X_MAX, s.horizon)])
     x = np.zeros(2)
     states, torques, others, matrices = [x], [], [], []
     for _ in range(s.steps):
@@ -51,7 +54,7 @@ def run(s: Settings) -> dict[str, np.ndarray]:
         )
         matrices.append([np.abs(a - b).max() for a, b in zip(qp, own, strict=True)])
         torques.append(independent.osqp(qp)[:1])
-        solution = jm.solve_qp(jm.QP(P=qp.H, q=qp.f, A=qp.G, l=qp.l, u=qp.u))
+        solution = jm.solve_qp(jm.QP(qp.H, qp.f, qp.G, qp.l, qp.u, row_sizes=sizes))
         plan = controller.plan(x, GOAL)
         assert solution.status == plan.status == jm.Status.SOLVED
         others.append([solution.z[0], plan.inputs[0, 0]])
