@@ -16,7 +16,7 @@ from jaxmpc.closed_loop.simulation import Run, simulate
 from jaxmpc.files import as_json, open_folder, versions, write_arrays, write_json
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.plan import broken_at_start
-from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.problem import MPC, Outputs, as_tuple, output_stages
 from jaxmpc.qp.admm import DEFAULT
 from jaxmpc.qp.status import Status
 from jaxmpc.sets.limits import row_violations, rows_kept
@@ -78,17 +78,14 @@ class LinearLoops:
         return run.on_host(), w
 
 
-def hard_outputs(
-    config: configs.Config, states: np.ndarray, inputs: np.ndarray
-) -> list[tuple[Any, np.ndarray]]:
-    """Return the hard rows of [[outputs]], each with the points (x, u) (B, T, n + m) of loops at
-    which a plan made there, or a step before, holds them."""
+def hard_outputs(mpc: MPC, states: np.ndarray, inputs: np.ndarray) -> list[tuple[Any, np.ndarray]]:
+    """Return the hard outputs, each with the points (x, u) (B, T, n + m) of loops at which a plan
+    made there, or a step before, holds them."""
     points = np.concatenate([states[:, :-1], inputs], axis=-1)
     m, found = inputs.shape[-1], list[tuple[Any, np.ndarray]]()
-    for rows in config.outputs:
-        usual = config.mpc.constrained_stages or (int(not config.mpc.constrain_initial),)
-        first = min(rows.stages or usual)
-        if rows.rho is not None or first > 1:
+    for rows in as_tuple("outputs", mpc.outputs, Outputs):
+        stages = output_stages(mpc, rows)
+        if not stages or min(stages) > 1:
             continue
         C = np.asarray(rows.C)
         D = np.zeros((len(C), m)) if rows.D is None else np.asarray(rows.D)
@@ -96,7 +93,7 @@ def hard_outputs(
             np.full(len(C), free) if end is None else np.asarray(end)
             for end, free in ((rows.lower, -np.inf), (rows.upper, np.inf))
         )
-        found.append(((np.hstack([C, D]), lower, upper), points[:, first:]))
+        found.append(((np.hstack([C, D]), lower, upper), points[:, min(stages) :]))
     return found
 
 
@@ -124,7 +121,7 @@ def simulate_problem(loops: LinearLoops, output: Path, overwrite: bool) -> None:
         run, w = loops.run(mpc, x0s)
     states, inputs, status = (np.asarray(v) for v in (run.states, run.inputs, run.status))
     planned = status[:, 0] == Status.SOLVED
-    of_states = [(config.state_limits(), states), *hard_outputs(config, states, inputs)]
+    of_states = [(config.state_limits(), states), *hard_outputs(mpc, states, inputs)]
     limits = [*of_states, (mpc.inputs, inputs)]
     kept = np.all([rows_kept(*pair).all(axis=(1, 2)) for pair in limits], axis=0) & planned
     worst = max(float(row_violations(*pair)[planned].max(initial=0.0)) for pair in of_states)
