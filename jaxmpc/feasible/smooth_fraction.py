@@ -80,10 +80,10 @@ def membership(
     for name, value in (("x0s", x0s), ("width", width)):
         require_real(name, value)
     newton_steps = whole("newton_steps", newton_steps, 1)
-    given = map(as_array, (x0s, width))
-    x0s, width = arrays([v if hasattr(v, "ndim") else np.asarray(v) for v in given])
+    x0s, width = (v if hasattr(v, "ndim") else np.asarray(v) for v in map(as_array, (x0s, width)))
     if x0s.ndim != 2 or x0s.shape[1] != mpc.dimension:
         fail("x0s", f"shape {x0s.shape}", f"Give states (B, {mpc.dimension}), one a row")
+    x0s, width = arrays((x0s, width))  # JAX's from here on, which compiles
     if concrete(width) and not (np.ndim(width) == 0 and 0 < float(width) < 1):
         fail("width", f"{width}", "Give a fraction of the limits between 0 and 1, such as 0.02")
     condensed = condense(mpc)
