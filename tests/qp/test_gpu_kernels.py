@@ -360,9 +360,9 @@ def test_a_kernel_of_batches_of_batches(texts):
     c = jnp.asarray(rng.standard_normal((3, 1)))
     inner = jax.vmap(one, in_axes=(0, 0, None))
     found = jax.vmap(inner, in_axes=(0, None, 0))(a, b, c)
-    np.testing.assert_allclose(found, a * b + c[:, None], atol=1e-15)
+    np.testing.assert_allclose(found, a * b + c[:, None], rtol=1e-15, atol=1e-15)
     found = jax.vmap(inner, in_axes=(1, None, None))(a.swapaxes(0, 1), b, c[0])
-    np.testing.assert_allclose(found, a * b + c[0], atol=1e-15)
+    np.testing.assert_allclose(found, a * b + c[0], rtol=1e-15, atol=1e-15)
     with pytest.raises(NotImplementedError, match="no text in Triton for the operation sin"):
         sines = lambda a, out: kernel.store(out.at[kernel.indices(16)], jnp.sin(a[0]))
         kernel.call(sines, jax.ShapeDtypeStruct((16,), jnp.float64))(a[0, 0])
