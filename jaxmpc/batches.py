@@ -32,7 +32,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from tqdm.std import tqdm
 
 from jaxmpc.checks import fail, shown, whole
-from jaxmpc.qp.jax_transformations import own_modes
+from jaxmpc.qp.jax_transformations import default_device, default_platform, own_modes
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -97,7 +97,7 @@ class Compiled:
     def _programs(self, shares: list[tuple]) -> list[Any]:
         """Return the program of each device."""
         leaves, tree = jax.tree.flatten(shares[0])
-        key = tree, tuple(jax.typeof(leaf) for leaf in leaves)
+        key = tree, tuple(map(_kind, leaves)), default_device()
         with self._compiles:  # threads that need the same program wait for one of them
             if key not in self.programs:
                 start = time.perf_counter()
@@ -116,6 +116,12 @@ class Compiled:
         shape = sum(map(len, parts)), *parts[0].shape[1:]
         place = NamedSharding(self.places[0].mesh, PartitionSpec("batch"))
         return jax.make_array_from_single_device_arrays(shape, place, list(parts))
+
+
+def _kind(leaf: Any) -> tuple:
+    """Return what a program is compiled for: type and shape, and where the argument has to stay."""
+    stays = isinstance(leaf, jax.Array) and leaf.committed
+    return jax.typeof(leaf), leaf.sharding if stays else None
 
 
 def _share(v: Any, *, device: jax.Device, i: int, count: int, batched: bool) -> jax.Array:
@@ -250,7 +256,7 @@ def default_chunk(numbers: float = 4096, most: int = 128 * CHUNK) -> int:
     """Return how many points a compiled program takes at once on the present device. numbers: of
     float64, that it holds of each; all of them take a quarter of the memory of a GPU at most.
     most: points at once, elsewhere than on a CPU."""
-    if jax.default_backend() == "cpu":
+    if default_platform() == "cpu":
         return CHUNK
     fitting = device_bytes() / 4 / (8 * numbers)
     return 2 ** int(np.log2(np.clip(fitting, CHUNK, most)))
@@ -265,7 +271,7 @@ def cores() -> int:
 def workers() -> int:
     """Return how many chunks to run side by side: one a core of a CPU, whose programs use little
     more than one, for most of their steps are too small to be divided; one on other devices."""
-    return cores() if jax.default_backend() == "cpu" else 1
+    return cores() if default_platform() == "cpu" else 1
 
 
 def side_by_side(

@@ -140,6 +140,31 @@ def check_plans_left_there():
     near(np.asarray(few.inputs)[solved[:203]], rows(one, slice(203)).inputs[solved[:203]])
 
 
+def check_data_of_other_devices():
+    """Programs run where JAX's own do: where their data were put, or on `jax.default_device`."""
+    import jax
+
+    import jaxmpc as jm
+
+    first, other = jax.devices()[:2]
+    x, solver = states(11)[:5], jm.ADMM(30, newton_steps=5)
+    with jax.enable_x64(True):
+        there = jax.device_put(x, other)
+        controller = jm.Controller(problem(), solver)
+        solve = lambda x, controller=controller: jm.solve_many(controller, x, to_host=False).inputs
+        one = solve(x)
+        assert one.devices() == {first}
+        moved = [solve(there), solve(x, jax.device_put(controller, other))]
+        with jax.default_device(other):
+            moved.append(solve(x))
+        for inputs in moved:
+            assert inputs.devices() == {other}
+            same(inputs, one)
+        loops = lambda x: jm.simulate_many(controller, problem().system, x, 2).states
+        same(loops(there), loops(x))
+    same(jm.map_feasible_set(problem(), there).label, jm.map_feasible_set(problem(), x).label)
+
+
 def check_large_results():
     """Copies by several threads, into parts of arrays that are there."""
     from jaxmpc.batches import COPIED, joined
@@ -308,7 +333,7 @@ def check_refusals():
 
 
 CHECKS = {name: found for name, found in globals().items() if name.startswith("check_")}
-QUICK = ("check_map", "check_programs", "check_refusals")
+QUICK = ("check_data_of_other_devices", "check_map", "check_programs", "check_refusals")
 LONG = ("check_weights_by_gauss_newton_steps",)  # whose candidates are those of samples too
 
 

@@ -61,6 +61,8 @@ def export_jax(
         (b,) = jax.export.symbolic_shape("b")
         sizes = (n, n, m, m) if mpc.input_in_state else (n, n, m)
         given = [jax.ShapeDtypeStruct((b, size), dtype) for size in sizes]
-        program = jax.export.export(jax.jit(jax.vmap(plan)), platforms=platforms)(*given)
+        # As for a CPU: kernels for GPUs are neither of any size of batch nor for other platforms.
+        with jax.default_device("cpu"):
+            program = jax.export.export(jax.jit(jax.vmap(plan)), platforms=platforms)(*given)
     path.write_bytes(program.serialize())
     return path

@@ -37,7 +37,7 @@ from jaxmpc.feasible.hard_constraints import ExactData
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.rays import closed_bounds, filled
 from jaxmpc.pytrees import pytree
-from jaxmpc.qp.jax_transformations import own_modes
+from jaxmpc.qp.jax_transformations import default_platform, own_modes
 
 # Coordinates up to which the polytopes have few facets.
 MOST_COORDINATES = 4
@@ -190,7 +190,7 @@ _made: WeakKeyDictionary[FeasibilityProblem, Hull | None] = WeakKeyDictionary()
 def hull_for(problem: FeasibilityProblem, points: float) -> Hull | None:
     """Return the hull of a problem if so many points are worth the rays, or if they were made for
     it before; None else, and where it has none."""
-    least = MANY * 4.0 ** (problem.dimension - 2) * (1 if jax.default_backend() == "cpu" else 8)
+    least = MANY * 4.0 ** (problem.dimension - 2) * (1 if default_platform() == "cpu" else 8)
     if problem not in _made and points >= least:
         _made[problem] = Hull.of(problem)
     return _made.get(problem)

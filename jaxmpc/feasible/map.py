@@ -24,6 +24,7 @@ from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.rays import closed_bounds
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import record
+from jaxmpc.qp.jax_transformations import default_platform
 from jaxmpc.qp.status import Status
 from jaxmpc.sets.convex_sets import Ellipsoid, Polytope
 from jaxmpc.sets.geometry import hull_volume
@@ -468,7 +469,7 @@ def label_chunks(
     if chunk is None:
         devices = count(chosen_devices(settings.get("devices")))
         held = 16 * sum(problem.rows.U.shape)  # vectors of rows and inputs
-        if jax.default_backend() != "cpu" and hull_for(problem, total) is not None:
+        if default_platform() != "cpu" and hull_for(problem, total) is not None:
             chunk = devices * default_chunk(held / 4, HULL)
         else:
             chunk = devices * default_chunk(held)

@@ -58,7 +58,13 @@ from jaxmpc.mpc.tightening import with_gain
 from jaxmpc.pytrees import prepared_pytree
 from jaxmpc.qp.admm import ADMM, DEFAULT, Factor
 from jaxmpc.qp.dual import has_dual_steps
-from jaxmpc.qp.jax_transformations import attempted_first, compiled_lightly, own_modes, varying
+from jaxmpc.qp.jax_transformations import (
+    attempted_first,
+    compiled_lightly,
+    default_platform,
+    own_modes,
+    varying,
+)
 from jaxmpc.qp.linalg import apply, arrays, host_arrays, matmul, on_device, rounding
 from jaxmpc.qp.problem import QP, QPSolution
 from jaxmpc.qp.residuals import NEAR, SHARE, Measured, Terms, worst
@@ -237,7 +243,7 @@ def _look_at_size(mpc: MPC, rows: int, variables: int) -> None:
         cure = "Give fewer steps, or a gain that damps faster, whose tube has fewer variables"
     require_memory(what, 8.0 * MATRICES * size**2, cure)
     seconds = SECONDS * float(size) ** 3
-    if seconds > LONG and jax.default_backend() == "cpu":
+    if seconds > LONG and default_platform() == "cpu":
         warnings.warn(f"{what}: a plan takes some {seconds:,.0f} s. {cure}", stacklevel=4)
 
 

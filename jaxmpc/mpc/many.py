@@ -53,7 +53,7 @@ from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.admm import ADMM, DEFAULT, scaled_multipliers
 from jaxmpc.qp.dual import RIDGE, has_dual_steps, most_rows
-from jaxmpc.qp.jax_transformations import map_blocks, true_places
+from jaxmpc.qp.jax_transformations import default_platform, map_blocks, true_places
 from jaxmpc.qp.linalg import matmul, solve
 from jaxmpc.qp.residuals import NEAR
 from jaxmpc.qp.solve import from_multipliers
@@ -152,7 +152,7 @@ class Batch:
     ) -> None:
         self.x, self.to_host, self.devices = x, to_host, devices
         self.controller = jax.device_put(controller, placement(devices))
-        on_cpu = jax.default_backend() == "cpu"
+        on_cpu = default_platform() == "cpu"
         # Elsewhere than on a CPU two chunks at once: one is computed while the other is copied.
         self.together = workers() if on_cpu and devices is None else 2
         self._begins: Any = nullcontext() if on_cpu else threading.Lock()
@@ -168,7 +168,7 @@ class Batch:
         B = len(self.x)
         left = np.arange(B)
         # (On GPUs the solver's kernels take less time than the laws and the host's indices would.)
-        on_cpu = jax.default_backend() == "cpu"
+        on_cpu = default_platform() == "cpu"
         if transfer and self.to_host and on_cpu and B >= MANY and transferable(self.controller):
             self.block = self.chunk  # one size, whose programs are compiled once
             left = self._transfer()

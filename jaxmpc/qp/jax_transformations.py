@@ -163,7 +163,7 @@ def compiled_lightly(level: int, **options: Any) -> Callable[[Callable[..., R]],
         @functools.wraps(function)
         def call(*args: Any, **kwargs: Any) -> R:
             # JAX refuses options of the compiler inside another program.
-            alone = jax.default_backend() == "cpu" and concrete(args)
+            alone = default_platform() == "cpu" and concrete(args)
             return light(*args, **kwargs) if alone else whole(*args, **kwargs)
 
         return call
@@ -177,7 +177,7 @@ def differentiated_apart(tree: T) -> T:
     The derivative with respect to what a batch shares is a sum over the batch. In one kernel with
     other results that took ten times as long as in its own (H100, XLA of JAX 0.11).
     """
-    return _apart(tree) if jax.default_backend() == "gpu" else tree
+    return _apart(tree) if default_platform() == "gpu" else tree
 
 
 @jax.custom_jvp
@@ -220,9 +220,24 @@ def tree_where(condition: Array, a: T, b: T) -> T:
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), a, b)
 
 
+def default_device() -> jax.Device | str | None:
+    """Return the value of `jax.default_device`, of which JAX's stubs do not know where it is read.
+    Traces are remembered by it."""
+    config: Any = jax.config
+    return config.jax_default_device
+
+
+def default_platform() -> str:
+    """Return the platform on which programs run by default, "cpu" or "gpu": that of
+    `jax.default_device`, else of JAX's default backend."""
+    device = default_device()
+    name = jax.default_backend() if device is None else getattr(device, "platform", device)
+    return "gpu" if name in ("cuda", "rocm") else name
+
+
 def on_gpu() -> bool:
     """Return whether programs run by default on a GPU for which there are kernels."""
-    return jax.default_backend() == "gpu" and has_compiler()
+    return default_platform() == "gpu" and has_compiler()
 
 
 def has_kernels(rows: int) -> bool:
@@ -263,7 +278,7 @@ def group_sizes(batch: int, steps: Steps = "short", work: int = 0) -> list[int]:
     A batch of symbolic size (`jax.export`) is one group."""
     if not isinstance(batch, int):
         return [batch]
-    if jax.default_backend() == "cpu":
+    if default_platform() == "cpu":
         if steps == "long" and batch > LONG_CPU:
             return [LONG_CPU, GROUP_CPU]
         return [min(batch, RECURSION_CPU if steps == "recursion" else GROUP_CPU)]
@@ -343,7 +358,7 @@ def attempted_first(
             plain = lambda *leaves: function(*jax.tree.unflatten(tree, leaves))
             return jax.vmap(plain, in_axes=[0 if b else None for b in batched])
 
-        if jax.default_backend() != "cpu" or not isinstance(size, int) or 2 * size <= BLOCK:
+        if default_platform() != "cpu" or not isinstance(size, int) or 2 * size <= BLOCK:
             return all_batched(many(whole)(*leaves))
         run = partial(_attempted, many(attempt), many(whole), batched)
         return all_batched(_of_one_batch(run, batched)(*leaves))

@@ -9,6 +9,7 @@ from jax import Array
 from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Primitive, jaxpr_as_fun
 
+from jaxmpc.qp.jax_transformations import default_platform
 from jaxmpc.qp.linalg import JAXLIB
 
 # How many operations XLA of old jaxlibs may fuse on a CPU.
@@ -127,7 +128,7 @@ def in_pieces(function: Callable, size: int = PIECE) -> Callable:
     """
 
     def run(*args: Any) -> Any:
-        if jax.default_backend() != "cpu" or not (0, 7, 0) <= JAXLIB < (0, 11, 1):
+        if default_platform() != "cpu" or not (0, 7, 0) <= JAXLIB < (0, 11, 1):
             return function(*args)
         closed, shape = jax.make_jaxpr(function, return_shape=True)(*args)
         jaxpr, leaves = closed.jaxpr, jax.tree.leaves(args)

@@ -506,6 +506,22 @@ def test_without_a_compiler_there_are_no_kernels_and_one_line_says_so(monkeypatc
         clear()
 
 
+def test_no_kernels_where_programs_run_on_a_cpu_beside_a_gpu(tmp_path, monkeypatch):
+    """Elsewhere than on a GPU the programs of a kernel run one after the other."""
+    from jaxmpc.export import export_jax
+
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(jax_transformations, "has_compiler", lambda: True)
+    for device, there in ((None, True), (jax.devices("cpu")[0], False), ("cpu", False)):
+        with jax.default_device(device):
+            assert jax_transformations.on_gpu() == there
+    traced = jax.make_jaxpr(jax.vmap(jm.Controller(joint(), SOLVER).plan))(STATES)
+    assert "gpu_kernel" in str(traced)
+    pytest.importorskip("flatbuffers")
+    monkeypatch.setattr(kernel.kernel_p, "bind", None)
+    export_jax(joint(), tmp_path / "plan", SOLVER, dtype="float32")
+
+
 @pytest.mark.parametrize(
     ("n", "m", "taken"),
     [(20, 60, True), (156, 156, True), (40, 200, True), (140, 420, False), (20, 600, False)],

@@ -33,6 +33,7 @@ from jaxmpc.files import as_json, check_results, open_folder, remove_files, writ
 from jaxmpc.mpc.condense import condensed_bytes
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.admm import ADMM
+from jaxmpc.qp.jax_transformations import default_platform
 from jaxmpc.robots.film import render, save_video
 from jaxmpc.robots.load import load_robot, model_hash
 from jaxmpc.robots.robot import Robot
@@ -72,7 +73,7 @@ class Simulate(SimulateOptions):
         reference, input_reference = robot_references(robot, target)
         seconds: Any = command.seconds
         steps = max(1, round(seconds / robot.dt))
-        each = 256 if jax.default_backend() == "cpu" else 4096
+        each = 256 if default_platform() == "cpu" else 4096
         chunk = self.chunk or (self.devices or 1) * each
         open_folder(self.output)
         with Compiling() as wait:
