@@ -44,6 +44,21 @@ def dimensions(value: Any) -> int | None:
         return None
 
 
+def of_known_type(value: Any) -> Any:
+    """Return NumPy numbers of a type that JAX does not have as float64, anything else as it is: of
+    the other byte order, as in files of other machines, or longer than eight bytes."""
+    if isinstance(value, np.ndarray | np.generic) and value.dtype.kind in "iuf":
+        if not value.dtype.isnative or value.dtype.itemsize > 8:
+            return value.astype(np.float64)
+    return value
+
+
+def numpy_array(value: Any) -> np.ndarray:
+    """Return numbers as an array of NumPy of a type that JAX has."""
+    array: np.ndarray = of_known_type(np.asarray(value))
+    return array
+
+
 def store_floats(instance: Any, *names: str) -> None:
     """Make arrays of floats of the named fields of a frozen dataclass where they are lists, or
     NumPy arrays of whole numbers: one leaf each, which can be differentiated and stacked.
@@ -57,9 +72,10 @@ def store_floats(instance: Any, *names: str) -> None:
             if dimensions(value) is None or isinstance(value, np.ma.MaskedArray):
                 require_real(name, value)
             value = _array(value)
+        value = of_known_type(value)
         if isinstance(value, np.ndarray) and value.dtype.kind in "iu":
             value = value.astype(float)
-        floats = isinstance(value, np.ndarray) and value.dtype.kind == "f"
+        floats = isinstance(value, np.ndarray | np.floating) and value.dtype.kind == "f"
         if floats or isinstance(value, jax.Array):
             object.__setattr__(instance, name, value)
 
@@ -88,7 +104,7 @@ def as_column(value: Reals) -> jax.Array | np.ndarray:
 def _array(value: Reals) -> jax.Array | np.ndarray:
     """Return an array of JAX as it is, lists of traced numbers as one, all else as NumPy's."""
     value = as_array(value)
-    return value if isinstance(value, jax.Array) else np.asarray(value)
+    return value if isinstance(value, jax.Array) else numpy_array(value)
 
 
 def as_array(value: Any) -> Any:

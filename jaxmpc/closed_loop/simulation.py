@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxmpc.arrays import Reals
+from jaxmpc.arrays import Reals, numpy_array
 from jaxmpc.batches import (
     Compiled,
     Devices,
@@ -474,7 +474,7 @@ def simulate_many(
     for argument, value in {"x0s": x0s, "controller": controller, "plant": plant}.items():
         require_untraced(argument, value, cure)
     require_real("x0s", x0s)
-    x0s, variations = np.asarray(x0s), dict(variations or {})
+    x0s, variations = numpy_array(x0s), dict(variations or {})
     size = getattr(controller, "state_size", None)
     if x0s.ndim != 2 or not len(x0s) or size not in (None, x0s.shape[1]):
         cure = f"Give (B, {size or 'n'}), B ≥ 1, one initial state a row"
@@ -489,7 +489,7 @@ def simulate_many(
     plant, _, shared = checked_loop(controller, plant, x0s[0], steps, given)
     several = {"reference": references, "input_reference": input_references}
     several["disturbance"] = disturbances
-    own = {name: np.asarray(value) for name, value in several.items() if value is not None}
+    own = {name: numpy_array(value) for name, value in several.items() if value is not None}
     _require_own(own, given, controller, steps, len(x0s))
     numbers = None if noise is None else np.arange(len(x0s))
     each = Each(x0s, variations, own, numbers)

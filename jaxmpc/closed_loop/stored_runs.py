@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
-from jaxmpc.arrays import Reals
+from jaxmpc.arrays import Reals, numpy_array
 from jaxmpc.batches import Part, Timing, first_rows, padded, work_off
 from jaxmpc.checks import fail
 from jaxmpc.closed_loop.feedback import Feedback
@@ -84,7 +84,7 @@ def simulate_into(
 
     check_results(path, resume, overwrite)
     target = {"reference": reference, "input_reference": input_reference, "devices": devices}
-    loops = _Loops(controller, robot, np.asarray(x0s), int(steps), target, dict(factors or {}))
+    loops = _Loops(controller, robot, numpy_array(x0s), int(steps), target, dict(factors or {}))
     loops.validate()
     number = Constant(np.arange(len(loops.x0s)), ("sample",), {"long_name": "robot"})
     points = Constant(loops.x0s, ("sample", "state"), {"long_name": "initial state"})

@@ -1,5 +1,6 @@
 """A controller as a stored program of JAX (StableHLO), for other processes, languages and years."""
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +48,10 @@ def export_jax(
     require_kind("solver", solver, ADMM)
     if dtype not in ("float64", "float32"):
         fail("dtype", f"{dtype!r}", 'Give "float64" or "float32"')
+    try:
+        jax.devices("cpu")
+    except RuntimeError:
+        fail("JAX_PLATFORMS", f"{os.environ['JAX_PLATFORMS']}", "Add the platform cpu to it")
     (path,) = prepared_paths(path.parent, [path.name], overwrite)
     n, m = mpc.system.n, mpc.system.m
 

@@ -44,9 +44,10 @@ MOST_COORDINATES = 4
 # Rays: gap of the volumes at which they stop, and with which the hull is of use; rounds, and the
 # most rays in one.
 GAP, USEFUL, ROUNDS, MOST_RAYS = 1e-9, 0.05, 8, 200
-# Points of two coordinates that take longer by the other stages, on a CPU, than the rays do; each
-# further coordinate takes four times as many.
-MANY = 2**14
+# Points of two coordinates that take longer by the other stages than the rays do, on a CPU and
+# elsewhere; each further coordinate takes four times as many. (One joint, N = 20, H100: 131,072
+# points 42 ms by the other stages, 88 by rays; 262,144 66 and 90; 1,048,576 136 and 136.)
+MANY, MANY_ELSEWHERE = 2**14, 2**19
 
 
 @pytree
@@ -190,7 +191,8 @@ _made: WeakKeyDictionary[FeasibilityProblem, Hull | None] = WeakKeyDictionary()
 def hull_for(problem: FeasibilityProblem, points: float) -> Hull | None:
     """Return the hull of a problem if so many points are worth the rays, or if they were made for
     it before; None else, and where it has none."""
-    least = MANY * 4.0 ** (problem.dimension - 2) * (1 if default_platform() == "cpu" else 8)
+    many = MANY if default_platform() == "cpu" else MANY_ELSEWHERE
+    least = many * 4.0 ** (problem.dimension - 2)
     if problem not in _made and points >= least:
         _made[problem] = Hull.of(problem)
     return _made.get(problem)

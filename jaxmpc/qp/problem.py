@@ -18,10 +18,12 @@ from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxmpc.arrays import of_known_type
 from jaxmpc.checks import (
     concrete,
     fail,
@@ -367,8 +369,8 @@ class QP:
         return cls(P=P, q=q, A=matrix, l=low, u=high)
 
     def dense(self) -> "QP":
-        """Return the program with sparse matrices made dense."""
-        return replace(self, P=dense(self.P), A=dense(self.A))
+        """Return the program with sparse matrices made dense, in types that JAX has."""
+        return jax.tree.map(of_known_type, replace(self, P=dense(self.P), A=dense(self.A)))
 
     def validate(self) -> None:
         """Raise ValueError for wrong shapes, NaN, asymmetric or indefinite P, or l > u."""

@@ -16,7 +16,7 @@ import numpy as np
 from jax import Array, lax
 from jax.typing import DTypeLike
 
-from jaxmpc.arrays import Reals
+from jaxmpc.arrays import Reals, of_known_type
 from jaxmpc.checks import concrete, fail, require_kind, require_shape
 from jaxmpc.qp.admm import (
     ADMM,
@@ -472,6 +472,7 @@ def feasibility_margin(
     status is that of the linear program: t is exact where it is SOLVED. One instance;
     `jax.vmap` for many. Raises ValueError for wrong shapes and for balls.
     """
+    qp = qp.dense()
     qp.validate()
     m, n = np.shape(qp.A)
     if qp.balls:
@@ -480,7 +481,7 @@ def feasibility_margin(
         require_shape("scale", scale, (m,), "One for each row of A")
     qp = as_arrays(qp)
     dtype, bounds = qp.q.dtype, qp.bounds.hard()
-    s = jnp.ones(m, dtype) if scale is None else jnp.asarray(scale, dtype)
+    s = jnp.ones(m, dtype) if scale is None else jnp.asarray(of_known_type(scale), dtype)
     # Variables (z, t): Az + t s ≤ u, l ≤ Az − t s, t ≤ max_margin.
     last = jnp.zeros(n + 1, dtype).at[n].set(1.0)
     A = jnp.concatenate([jnp.block([[qp.A, s[:, None]], [qp.A, -s[:, None]]]), last[None]])

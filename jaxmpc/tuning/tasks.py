@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmpc.arrays import Reals
+from jaxmpc.arrays import Reals, numpy_array
 from jaxmpc.checks import fail, require_memory
 from jaxmpc.closed_loop.outcome import evaluate_runs
 from jaxmpc.closed_loop.robot_controller import RobotController, robot_references
@@ -238,7 +238,7 @@ def linear_task(
         make=make,
         parameters=parameters,
         plant=plant,
-        x0s=np.asarray(x0s),
+        x0s=numpy_array(x0s),
         variations={},
         validation=_validation(validation, len(np.asarray(x0s))),
         loss=weight_loss(mpc.Q, mpc.R, limits, reference, input_reference, **terms),
@@ -293,7 +293,7 @@ def robot_task(
         make=make,
         parameters=parameters,
         plant=robot,
-        x0s=np.asarray(x0s),
+        x0s=numpy_array(x0s),
         variations=variations,
         validation=_validation(validation, len(np.asarray(x0s))),
         loss=loss,

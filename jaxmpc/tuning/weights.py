@@ -10,7 +10,7 @@ import jax
 import numpy as np
 import optax
 
-from jaxmpc.arrays import Reals
+from jaxmpc.arrays import Reals, numpy_array
 from jaxmpc.batches import chosen_devices
 from jaxmpc.checks import fail, nearest, whole
 from jaxmpc.closed_loop.simulation import Conditions, Run, require_variations
@@ -157,10 +157,10 @@ def prepared(
     """Return the closed loops of `tune_weights`, whose arguments these are, without compiling."""
     require_parameters(parameters)
     settings.validate()
-    x0s = np.asarray(x0s)
+    x0s = numpy_array(x0s)
     if x0s.ndim != 2 or not len(x0s):
         fail("x0s", f"shape {x0s.shape}", "Give initial states (B, n)")
-    variations = {name: np.asarray(v) for name, v in dict(variations or {}).items()}
+    variations = {name: numpy_array(v) for name, v in dict(variations or {}).items()}
     require_variations(plant, variations, len(x0s))
     if mode not in MODES:
         fail("mode", f"{mode!r}", f"Give one of {', '.join(MODES)}")

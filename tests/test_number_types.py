@@ -1,0 +1,86 @@
+"""Numbers of types that JAX does not have: results are those of the same numbers in float64.
+
+Files hold them: `.mat`, FITS and HDF5 of machines with the other byte order, `np.longdouble`.
+"""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+import scipy.sparse
+
+import jaxmpc as jm
+
+STATE, STATES = [0.5, 0.1], [[0.5, 0.1], [0.4, -0.2], [-3.0, 0.0]]
+
+
+def problem(cast):
+    A, B = cast([[1, 0.1], [0, 1]]), cast([[0], [0.1]])
+    return jm.MPC(
+        jm.LinearSystem(A, B, dt=0.1), cast(np.eye(2)), cast([[1]]), 5,
+        states=jm.Box(cast([-1, -1]), cast([1, 1])), inputs=jm.Box(cast([-1]), cast([1])),
+        terminal_cost=cast([3, 4]), input_rate_limit=cast([0.5]), input_rate_weight=cast([[0.1]]),
+    )  # fmt: skip
+
+
+def program(cast):
+    rows = cast([[1, 0], [0, 1]])
+    return jm.QP(cast([[2, 0], [0, 1]]), cast([1, 1]), rows, cast([-1, -0.5]), cast([1, 1]))
+
+
+def sparse():
+    qp = program(np.asarray)
+    return replace(qp, P=scipy.sparse.csc_matrix(qp.P), A=scipy.sparse.coo_matrix(qp.A))
+
+
+def tuned(cast):
+    mpc = replace(problem(np.asarray), input_rate_limit=None, input_rate_weight=None)
+    parameters = {"Q": jm.Parameter(cast(np.eye(2)), "diagonal")}
+    make = lambda v: replace(mpc, Q=v["Q"])
+    return jm.tune_weights(make, parameters, mpc.system, cast(STATES), steps=2, updates=1).values
+
+
+def mapped(cast):
+    points = np.hstack([STATES, np.zeros((3, 1))])
+    return jm.map_feasible_set(problem(cast), cast(points)).label
+
+
+def looped(cast):
+    mpc, x = problem(cast), cast(STATES[:2])
+    return jm.simulate_many(jm.Controller(mpc), mpc.system, x, 2, references=x).states
+
+
+CALLS = {
+    "plan": lambda c: jm.solve(problem(c), c(STATE), c(STATE), previous_input=c([0.0])).inputs,
+    "map": mapped,
+    "program": lambda c: program(c).dense(),
+    "inside jit": lambda c: jax.jit(jax.tree.leaves)(jm.mpc.soften(problem(c), c(50.0))),
+    "set": lambda c: jm.Polytope(c([[1, 0], [0, 1], [-1, -1]]), c([1, 1, 1])).volume(),
+}
+SLOW = {
+    "plans": lambda c: jm.solve_many(problem(c), c(STATES)).inputs,
+    "solution": lambda c: jm.solve_qp(program(c)).z,
+    "margin": lambda c: jm.qp.feasibility_margin(program(c), c([1, 2]))[0],
+    "sparse": lambda c: jm.qp.feasibility_margin(sparse(), c([1, 2]))[0],
+    "loops": looped,
+    "tuned": tuned,
+}
+
+
+def same(call):
+    wanted = call(np.asarray)
+    for dtype in (">f8", np.longdouble):
+        found = call(lambda v, dtype=dtype: np.asarray(v).astype(dtype))
+        jax.tree.map(np.testing.assert_array_equal, found, wanted)
+
+
+@pytest.mark.parametrize("call", CALLS.values(), ids=CALLS)
+def test_results_are_those_in_float64(call):
+    same(call)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("call", SLOW.values(), ids=SLOW)
+def test_more_results_are_those_in_float64(call):
+    same(call)
