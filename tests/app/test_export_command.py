@@ -32,3 +32,9 @@ def test_a_program_of_jax(tmp_path, capsys):
     cli.main(["export", "--horizon", "4", "--law", "jax", "--output", str(tmp_path / "new")])
     assert "jax.export.deserialize" in capsys.readouterr().out
     assert (tmp_path / "new" / "mpc.jax").stat().st_size > 10_000
+
+
+def test_steps_of_a_law_that_takes_none(tmp_path, capsys):
+    words = ["export", "--law", "explicit", "--iterations", "9", "--output", str(tmp_path)]
+    assert cli.main(words) == 2
+    assert "--iterations: 9 where --law explicit has regions" in capsys.readouterr().err

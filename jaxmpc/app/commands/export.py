@@ -36,6 +36,9 @@ class Export(ExportOptions):
             fail("limits.x_min", "bounds not every state", "Give --plans 0 for no check")
         mpc, solver = config.build_controlled(), config.build_solver() or ADMM()
         chosen = self.law == "steps" and self.plans and config.solver is None
+        if self.law == "explicit" and self.iterations is not None:
+            what = f"{self.iterations} where --law explicit has regions and takes no steps"
+            fail("--iterations", what, "Leave it out, or take --law steps")
         if self.iterations is not None:
             solver = dataclasses.replace(solver, iterations=self.iterations)
         dtype: Literal["float32", "float64"] = "float32" if self.single else "float64"
