@@ -80,20 +80,23 @@ class LinearLoops:
 
 def hard_outputs(mpc: MPC, states: np.ndarray, inputs: np.ndarray) -> list[tuple[Any, np.ndarray]]:
     """Return the hard outputs, each with the points (x, u) (B, T, n + m) of loops at which a plan
-    made there, or a step before, holds them."""
+    made there, or a step before, holds them; with the states (B, T + 1, n) where u plays no part
+    and the last plan holds the last state."""
     points = np.concatenate([states[:, :-1], inputs], axis=-1)
-    m, found = inputs.shape[-1], list[tuple[Any, np.ndarray]]()
+    found = list[tuple[Any, np.ndarray]]()
     for rows in as_tuple("outputs", mpc.outputs, Outputs):
         stages = output_stages(mpc, rows)
         if not stages or min(stages) > 1:
             continue
-        C = np.asarray(rows.C)
-        D = np.zeros((len(C), m)) if rows.D is None else np.asarray(rows.D)
+        C, D = np.asarray(rows.C), None if rows.D is None else np.asarray(rows.D)
         lower, upper = (
             np.full(len(C), free) if end is None else np.asarray(end)
             for end, free in ((rows.lower, -np.inf), (rows.upper, np.inf))
         )
-        found.append(((np.hstack([C, D]), lower, upper), points[:, min(stages) :]))
+        of_states = 1 in stages and (D is None or not D.any())
+        D = np.zeros((len(C), inputs.shape[-1])) if D is None else D
+        held = (C, lower, upper) if of_states else (np.hstack([C, D]), lower, upper)
+        found.append((held, (states if of_states else points)[:, min(stages) :]))
     return found
 
 
