@@ -21,7 +21,9 @@ Traces make many small objects that live on, which Python's collector visits aga
 runs more rarely (on Python 3.11, 4 and 7 % less CPU time in two groups of 60 tests).
 """
 
+import functools
 import gc
+import importlib.util
 import os
 import re
 import tempfile
@@ -51,6 +53,8 @@ MAPS = 15_000
 
 
 def pytest_configure(config):
+    about = "compared: about the comparison of robots with their files as they are loaded"
+    config.addinivalue_line("markers", about)
     # A program that another worker is about to write; this one compiles it then.
     config.addinivalue_line("filterwarnings", "ignore:Error reading persistent compilation cache")
 
@@ -69,7 +73,23 @@ def pytest_collection_modifyitems(items):
             item.add_marker("slow")
 
 
+@functools.cache
+def _comparison():
+    """Return the module that compares steps of robots with the C engine's, and its function."""
+    if importlib.util.find_spec("mujoco") is None:
+        return None
+    from jaxmpc.robots import mjx_gaps
+
+    return mjx_gaps, mjx_gaps._differences
+
+
+@pytest.hookimpl(tryfirst=True)  # before robots are made that all tests of a module share
 def pytest_runtest_setup(item):
+    """Load robots without the comparison of their steps with the C engine's, for which a program
+    is compiled each time, but where that is what is tested, and in slow tests."""
+    if (found := _comparison()) is not None:
+        whole = item.get_closest_marker("compared") or item.get_closest_marker("slow")
+        found[0]._differences = found[1] if whole else lambda *args: ()
     if item.get_closest_marker("cpu"):
         import jax
 

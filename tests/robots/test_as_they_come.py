@@ -10,8 +10,6 @@ from mujoco.mjx._src import collision_driver
 
 import jaxmpc as jm
 
-pytestmark = pytest.mark.usefixtures("uncompared")
-
 GRIPPER = """
 <mujoco><option timestep="0.01" gravity="0 0 0"/><worldbody>
 <body><joint name="finger" type="slide" axis="1 0 0" range="0 0.04"/>

@@ -11,8 +11,6 @@ from jaxmpc.closed_loop.variations import draw_robots
 from jaxmpc.robots.couplings import Couplings
 from jaxmpc.robots.equilibria import rest_at
 
-pytestmark = pytest.mark.usefixtures("uncompared")
-
 LINK = '<geom type="capsule" fromto="0 0 0 .3 0 0" size=".02" mass=".5"/>'
 MODEL = """<mujoco><default><geom contype="0" conaffinity="0"/></default><worldbody>
 <body name="a" pos="0 0 1"><joint name="j" axis="0 1 0" damping=".5" range="-90 90"/>{link}

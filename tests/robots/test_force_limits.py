@@ -9,8 +9,6 @@ import pytest
 import jaxmpc as jm
 from jaxmpc.robots.force_limits import ForceLimits, force_limits, stopping_limits
 
-pytestmark = pytest.mark.usefixtures("uncompared")
-
 SERVO = """<mujoco><option gravity="0 0 0" integrator="implicitfast"/><worldbody><body>
 <joint name="j" axis="0 0 1"/><geom type="capsule" fromto="0 0 0 1 0 0" size=".02" mass="3"/></body>
 </worldbody><actuator><position joint="j" kp="200" kv="20" ctrlrange="-1.2 1.2" forcerange="-3 3"/>
@@ -67,8 +65,8 @@ def test_rows_are_the_forces_of_the_c_engine():
 
 
 def test_a_robot_without_such_limits_has_no_rows():
-    robot = jm.load_robot("arm2")
-    assert force_limits(robot, robot.home, np.zeros(2)) is None
+    robot = jm.load_robot("joint")
+    assert force_limits(robot, robot.home, np.zeros(1)) is None
     assert jm.robot_mpc(robot, horizon=3).outputs == ()
 
 

@@ -14,8 +14,6 @@ from jaxmpc.robots.intervals import Interval
 from jaxmpc.robots.polynomial_degrees import polynomial_degrees
 from jaxmpc.robots.taylor_enclosures import TaylorProgram
 
-pytestmark = pytest.mark.usefixtures("uncompared")
-
 
 def boxes(rng, count):
     """Intervals of all sizes about numbers of all sizes."""

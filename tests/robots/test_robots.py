@@ -13,8 +13,6 @@ import jaxmpc as jm
 from jaxmpc.robots import jaxpr_rewriting
 from jaxmpc.robots.configurations import difference, retract
 
-pytestmark = pytest.mark.usefixtures("uncompared")
-
 SLOW = ["quadrotor"] + [
     pytest.param(name, marks=pytest.mark.slow)
     for name in ("joint", "pendulum", "cartpole", "arm6", "arm7", "mixed")
@@ -227,10 +225,10 @@ def test_the_lessons_joint_is_exact():
 
 
 @pytest.mark.parametrize("name", SLOW)
-def test_steps_equal_the_c_engines(name, mixed):
+def test_steps_equal_the_c_engines(name, request):
     """100 control periods under random inputs, from states near the stops; the C engine runs by
     itself, but for the warm starts of its constraint solver (they change 1e-7)."""
-    robot = mixed if name == "mixed" else jm.load_robot(name)
+    robot = request.getfixturevalue("mixed") if name == "mixed" else jm.load_robot(name)
     start, _ = draw(robot, 1, seed=3, stretch=0.9, speed=0.3)
     u = np.random.default_rng(4).uniform(
         robot.input_limits.lower, robot.input_limits.upper, (100, robot.m)
@@ -455,8 +453,18 @@ def assert_gradient(modes):
         assert np.abs(found[2][1]) > 1e-4
 
 
+WRAPS = {
+    "jit": jax.jit,
+    "forward mode": lambda f: jax.jit(jax.vmap(jax.jacfwd(f), in_axes=(0, None))),
+    "values": lambda f: f,
+    "vmap": lambda f: jax.vmap(f, in_axes=(0, None)),
+}
+
+
 @pytest.mark.cpu
-def test_in_pieces_changes_nothing(monkeypatch):
+@pytest.mark.parametrize("wrap", WRAPS)
+@pytest.mark.first(2)
+def test_in_pieces_changes_nothing(monkeypatch, wrap):
     """As on the old jaxlibs: values, vmap, jit, forward mode, conditionals, constants."""
     monkeypatch.setattr(jaxpr_rewriting, "JAXLIB", (0, 10, 2))
     table = np.arange(5.0)
@@ -473,15 +481,10 @@ def test_in_pieces_changes_nothing(monkeypatch):
     text = str(jax.make_jaxpr(pieces)(x, tree))
     assert text.count("optimization_barrier") > 5
     batch = np.stack([x, -x, 2 * x])
-    for wrap, args in (
-        (lambda f: f, (x, tree)), (jax.jit, (x, tree)),
-        (lambda f: jax.vmap(f, in_axes=(0, None)), (batch, tree)),
-        (lambda f: jax.jit(jax.vmap(jax.jacfwd(f), in_axes=(0, None))), (batch, tree)),
-    ):  # fmt: skip
-        for a, b in zip(
-            *(jax.tree.leaves(wrap(f)(*args)) for f in (pieces, function)), strict=True
-        ):
-            np.testing.assert_allclose(a, b, rtol=1e-14, atol=1e-15)
+    args = (x if wrap in ("values", "jit") else batch), tree
+    found = (jax.tree.leaves(WRAPS[wrap](f)(*args)) for f in (pieces, function))
+    for a, b in zip(*found, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-14, atol=1e-15)
 
 
 @pytest.mark.slow

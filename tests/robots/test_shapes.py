@@ -9,8 +9,6 @@ from jaxmpc.closed_loop import evaluate_runs
 from jaxmpc.closed_loop.simulation import Run
 from jaxmpc.robots.film import _links
 
-pytestmark = pytest.mark.usefixtures("uncompared")
-
 INERTIA = '<inertia ixx=".02" iyy=".02" izz=".01" ixy="0" ixz="0" iyz="0"/>'
 URDF = f"""<robot name="two"><link name="base"/>
 <link name="first"><inertial><origin xyz="0 0 .2"/><mass value="1"/>{INERTIA}</inertial>

@@ -11,8 +11,6 @@ import jaxmpc as jm
 from jaxmpc.robots.film import _camera, _ends
 from jaxmpc.robots.load import _warn_of_meshes
 
-pytestmark = pytest.mark.usefixtures("uncompared")
-
 URDF = """<?xml version="1.0"?>
 <!-- <mujoco> in a comment -->
 <robot name="swing"><link name="base"/>
