@@ -114,6 +114,7 @@ def check_map(seed):
     np.testing.assert_array_equal(first.label[np.abs(off) > 1e-9] == 1, off[np.abs(off) > 1e-9] < 0)
 
 
+@pytest.mark.slow
 def test_labels_in_other_units():
     check_map(0)
 
@@ -232,13 +233,23 @@ def test_a_terminal_point_has_the_laws_multipliers():
         assert np.all(y[:, ~above] >= -1e-9 * (1 + np.abs(y).max()))
 
 
-def test_a_constant_state_is_no_reason_to_be_undecided():
+def with_a_constant_state():
+    """A drift as a third state that is 1, and as a constant of the dynamics."""
     system = jm.LinearSystem([[1, 1, 0.2], [0, 1.0, 0.1], [0, 0, 1]], [0.5, 1, 0])
     limits = jm.Box([-5, -5, 1], [5, 5, 1])
     mpc = jm.MPC(system, np.eye(3), 1.0, 3, limits, jm.Box(-1, 1), terminal_set=limits)
-    with_drift = integrator(system=replace(INTEGRATOR, c=np.array([0.2, 0.1])))
+    return mpc, integrator(system=replace(INTEGRATOR, c=np.array([0.2, 0.1])))
+
+
+@pytest.mark.slow
+def test_labels_with_a_constant_state():
+    mpc, with_drift = with_a_constant_state()
     labels = jm.map_feasible_set(mpc, np.column_stack([POINTS, np.ones(64)])).label
     np.testing.assert_array_equal(labels, jm.map_feasible_set(with_drift, POINTS).label)
+
+
+def test_a_constant_state_is_no_reason_to_be_undecided():
+    mpc, with_drift = with_a_constant_state()
     with pytest.raises(ValueError, match="flat"):
         jm.feasible_polytope(mpc)
     regions, plain = critical_regions(mpc), critical_regions(with_drift)

@@ -14,7 +14,7 @@ from jaxmpc.verify.stored_problem import Constraints
 
 # Problem, half the size of the mapped box, view.
 CASES = {
-    "one state": (problems.scalar(terminal=1.0), [1.5], {}),
+    "one state": (problems.scalar(horizon=4, terminal=1.0, constrain_initial=False), [1.5], {}),
     "lecture": (problems.lecture(), [1.2, 1.2], {}),
     "joint": (problems.joint(5), [1.7, 2.2], {}),
     "no limits at k = 0": (
@@ -41,11 +41,11 @@ def test_labels_and_proofs(name, monkeypatch):
     """Against the labels of the other stages, and the plans in exact arithmetic."""
     mpc, _, view = CASES[name]
     points = points_of(name, 600)
-    expected = jm.map_feasible_set(mpc, points, **view).label
+    expected = jm.map_feasible_set(mpc, points, chunk=64, **view).label
     monkeypatch.setattr(hull_labels, "MANY", 0)
     problem = FeasibilityProblem.of(mpc, **view)
     assert Hull.of(problem) is not None
-    labels = jm.map_feasible_set(mpc, points, **view).labels
+    labels = jm.map_feasible_set(mpc, points, chunk=64, **view).labels
     np.testing.assert_array_equal(labels.label, expected)
     assert set(expected) == {-1, 1}
     inside, outside = labels.label == 1, labels.label == -1
@@ -63,11 +63,11 @@ def test_they_decide_nearly_all(always, monkeypatch):
     """No other stage runs where all points are 1e-6 and more from the boundary."""
     mpc = problems.lecture()
     polytope = jm.feasible_polytope(mpc)
-    points = points_of("lecture", 4000)
+    points = points_of("lecture", 1000)
     distance = (points @ np.asarray(polytope.H).T - polytope.h).max(axis=1)
     run, programs = pipeline._run, []
     monkeypatch.setattr(pipeline, "_run", lambda *a: programs.append(a[0]) or run(*a))
-    label = jm.map_feasible_set(mpc, points[np.abs(distance) > 1e-6], chunk=1000).label
+    label = jm.map_feasible_set(mpc, points[np.abs(distance) > 1e-6], chunk=64).label
     np.testing.assert_array_equal(label, np.where(distance < 0, 1, -1)[np.abs(distance) > 1e-6])
     assert set(programs) <= {pipeline.compiled_hull(None), hull_labels.compiled_verdicts(None)}
 
@@ -126,9 +126,9 @@ def test_a_problem_keeps_its_cones(monkeypatch):
     problem = FeasibilityProblem.of(problems.lecture())
     points = points_of("lecture", 600)
     assert hull_labels.hull_for(problem, 100) is None
-    whole = jm.map_feasible_set(problem, points)
+    whole = jm.map_feasible_set(problem, points, chunk=64)
     monkeypatch.setattr(Hull, "of", lambda _: pytest.fail("made again"))
-    part = jm.map_feasible_set(problem, points[:100])
+    part = jm.map_feasible_set(problem, points[:100], chunk=64)
     np.testing.assert_array_equal(part.label, whole.label[:100])
     with pytest.raises(ValueError, match="axes, fixed: given with a FeasibilityProblem"):
         jm.map_feasible_set(problem, points, axes=(0, 1))
@@ -138,7 +138,7 @@ def test_labels_and_bounds_share_their_rays(monkeypatch):
     """Rays are sent once for the labels, and not again for bounds that are no closer."""
     monkeypatch.setattr(hull_labels, "MANY", 60)
     problem = FeasibilityProblem.of(problems.lecture())
-    mapped = jm.map_feasible_set(problem, points_of("lecture", 600))
+    mapped = jm.map_feasible_set(problem, points_of("lecture", 600), chunk=64)
     monkeypatch.setattr(rays, "close_gap", lambda *_, **__: pytest.fail("sent again"))
     low, high = mapped.refine(1e-8).volume_bounds()
     assert low <= high <= low * (1 + 1e-8)

@@ -73,7 +73,7 @@ def test_scalar(none, sign):
     ],
     ids=["k = 1..N", "k = 3", "x_N ≤ −7", "−2 x_N ≤ 1", "empty"],
 )
-@pytest.mark.first(1)
+@pytest.mark.slow
 def test_scalar_steps_and_terminal_sets(settings, edge):
     """Where the limit is not on x_0, or at the other end; by hand. x_N ≥ −1/2 needs x_0 ≥ −5.5."""
     x = np.array([-9.0, 0.5, 1.7, 3.0, 100.0])
@@ -132,7 +132,7 @@ def check(mpc, allow=0, whole=True) -> FeasibleSetMap:
     random = np.random.default_rng(1).uniform(-3, 3, (80, 2))
     inside = random[polygon.contains(random)]
     points = np.concatenate([random, 1e3 * random[:9], near(polygon, inside.mean(axis=0), 16)])
-    fmap = jm.map_feasible_set(mpc, points, chunk=192)
+    fmap = jm.map_feasible_set(mpc, points, chunk=64)
     truth = polygon.contains(points)
     decided = fmap.label != 0
     np.testing.assert_array_equal(fmap.label[decided], np.where(truth, 1, -1)[decided])
@@ -186,6 +186,7 @@ def test_terminal_set(none):
     check(planar("coupled", none, ("-0", "-1"), terminal_set=jm.Box([-0.5, -none], [none, none])))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["marginal", *slow("unstable")])
 def test_one_row(kind):
     """0.3 x_1 + x_2 ≤ 1: a wedge without end, whose facets have normals that are no floats."""
@@ -207,6 +208,7 @@ def test_inputs_are_bounded_by_the_states_they_lead_to(inputs):
 class TestRowsThatNoInputMoves:
     """They are half-spaces on x_0, whatever the inputs may do."""
 
+    @pytest.mark.slow
     def test_initial_limits(self):
         """x ≤ 1 and no limit on u at all: x_0 ≤ 1."""
         mpc = replace(ceiling(), inputs=None)
@@ -215,6 +217,7 @@ class TestRowsThatNoInputMoves:
         edges = fmap.labels.cut_offset[:4] / fmap.labels.cut_normal[:4, 0]
         assert np.all((edges >= 1) & (edges < 1 + 1e-11))
 
+    @pytest.mark.slow
     def test_euler(self):
         """q_1 = q_0 + 0.5 v_0 does not feel u_0; 3 q + 4 v ≤ 5 at k = 0 neither."""
         system = jm.LinearSystem(np.array([[1.0, 0.5], [0.0, 1.0]]), np.array([[0.0], [1.0]]))

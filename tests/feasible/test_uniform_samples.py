@@ -120,8 +120,9 @@ def test_chains_are_uniform_on_cubes_and_simplices():
     after = (chains.draw(4096, random) @ turn.T / sizes).ravel()
     assert abs(np.corrcoef(before, after)[0, 1]) < 0.03
 
-    rows = np.vstack([-np.eye(d), np.ones((1, d))])
-    chains = Chains(np.full(d, 0.1), rows, np.append(np.zeros(d), 1.0), 6 * d, 4096)
+    # As many rows as the box has, the last of them four times more, so that programs are shared.
+    rows = np.vstack([-np.eye(d), np.ones((d, d))])
+    chains = Chains(np.full(d, 0.1), rows, np.repeat([0.0, 1.0], d), 6 * d, 4096)
     chains.settle(random)
     y = chains.draw(16_384, random)
     for column in np.column_stack([y, 1 - y.sum(axis=1)]).T:
