@@ -49,12 +49,12 @@ def run(line):
 
 
 def test_sweep_writes_files_and_table(tmp_path, capsys):
-    assert run("sweep --grid 16 12 --horizon 5") == 0
+    assert run("sweep --grid 8 8 --horizon 6") == 0
     out = capsys.readouterr().out
     folder = tmp_path / "jaxmpc-sweep"
     assert {path.name for path in folder.iterdir()} == {"sweep.zarr", "map.png", "summary.json"}
     data = xr.open_zarr(folder / "sweep.zarr")
-    assert data["label"].shape == (16, 12) and data["plan"].shape == (16, 12, 5, 1)
+    assert data["label"].shape == (8, 8) and data["plan"].shape == (8, 8, 6, 1)
     assert data["label"].dims == ("q", "dq") and data["q"].attrs["units"] == "rad"
     summary = json.loads((folder / "summary.json").read_text())
     labels = data["label"].values
@@ -62,11 +62,11 @@ def test_sweep_writes_files_and_table(tmp_path, capsys):
     assert summary["counts"] == {
         "feasible": feasible,
         "infeasible": infeasible,
-        "undecided": 192 - feasible - infeasible,
+        "undecided": 64 - feasible - infeasible,
         "not finite": 0,
         "not run": 0,
     }
-    assert summary["config"]["mpc"]["horizon"] == 5
+    assert summary["config"]["mpc"]["horizon"] == 6
     assert 0 < summary["volume"]["inner"] <= summary["volume"]["outer"] <= 12
     for word in ("feasible", "undecided", "area from", "rad·rad/s", "QPs/s", "map.png"):
         assert word in out
@@ -74,21 +74,21 @@ def test_sweep_writes_files_and_table(tmp_path, capsys):
     assert np.all(labels[np.abs(data["q"].values) > 1.5] == -1)
     assert np.all(labels[:, np.abs(data["dq"].values) > 2.0] == -1)
     assert run("verify jaxmpc-sweep --exact") == 0
-    assert "192 of 192, 192 exactly" in capsys.readouterr().out
+    assert "64 of 64, 64 exactly" in capsys.readouterr().out
 
 
 def test_damage_is_repaired_by_resume_and_found_by_verify(tmp_path, capsys):
     """Flipped labels are no longer printed as fact, nor a missing chunk as a smaller count."""
-    line = "sweep --grid 16 12 --horizon 5"
+    line = "sweep --grid 8 8 --horizon 6"
     assert run(line) == 0
     path = tmp_path / "jaxmpc-sweep" / "sweep.zarr"
     summary = json.loads((path.parent / "summary.json").read_text())
     label = zarr.open_group(path, mode="r+", use_consolidated=False)["label"]
-    label[3, 4:9] = -label[3, 4:9]
+    label[3, 3:8] = -label[3, 3:8]
     assert run("verify jaxmpc-sweep") == 1
     out = capsys.readouterr().out
     assert "NOT VERIFIED" in out and "FAILS: block 0" in out
-    assert "FAILS: state 40" in out and "FAILS: state 44" in out
+    assert "FAILS: state 27" in out and "FAILS: state 31" in out
     assert run(f"{line} --resume") == 0
     assert "1 of 1 block that was done is missing or damaged" in capsys.readouterr().err
     shutil.rmtree(path / "plan" / "c")
@@ -162,9 +162,9 @@ def test_ctrl_c_keeps_blocks_and_says_how_to_resume(tmp_path, monkeypatch, capsy
             yield chunk
 
     monkeypatch.setattr(pipeline, "label_parts", interrupted)
-    assert run("sweep --grid 16 12 --horizon 5 --output 'my maps'") == 130
+    assert run("sweep --grid 8 8 --horizon 6 --output 'my maps'") == 130
     out = capsys.readouterr().out
-    assert "jaxmpc sweep --grid 16 12 --horizon 5 --output 'my maps' --resume" in out
+    assert "jaxmpc sweep --grid 8 8 --horizon 6 --output 'my maps' --resume" in out
     assert "blocks that were done are kept" in out
     asked = []
 
@@ -173,11 +173,11 @@ def test_ctrl_c_keeps_blocks_and_says_how_to_resume(tmp_path, monkeypatch, capsy
         return real(mpc, asked[-1], *args, **kwargs)
 
     monkeypatch.setattr(pipeline, "label_parts", counted)
-    resume = "sweep --grid 16 12 --horizon 5 --output 'my maps' --resume"
+    resume = "sweep --grid 8 8 --horizon 6 --output 'my maps' --resume"
     assert run(resume) == 0
     data = xr.open_zarr(tmp_path / "my maps" / "sweep.zarr")
     points = np.stack(np.meshgrid(data["q"], data["dq"], indexing="ij"), axis=-1)
-    np.testing.assert_array_equal(np.concatenate(asked[0]), points.reshape(-1, 2)[48:])
+    np.testing.assert_array_equal(np.concatenate(asked[0]), points.reshape(-1, 2)[32:])
     assert np.all(data["status"] != 0)
     assert run(resume) == 0 and len(asked) == 1
 
@@ -511,7 +511,7 @@ def test_output_in_an_encoding_that_lacks_characters(monkeypatch):
     """The unit of the area, rad·rad/s, has no place in ASCII: "?" is printed, and nothing fails."""
     out = io.TextIOWrapper(io.BytesIO(), "ascii")
     monkeypatch.setattr(sys, "stdout", out)
-    assert run("sweep --grid 16 12 --horizon 5 --output out") == 0
+    assert run("sweep --grid 8 8 --horizon 6 --output out") == 0
     out.seek(0)
     assert "rad?rad/s (inner bound)" in out.read()
 
@@ -543,7 +543,7 @@ sys.exit(cli.main(sys.argv[2:]))
 @pytest.mark.slow
 def test_a_full_disk_is_one_line_and_resume_goes_on(tmp_path, capsys):
     """While the store is made, and while a block is written."""
-    line = "sweep --grid 16 12 --horizon 5 --no-refine"
+    line = "sweep --grid 8 8 --horizon 6 --no-refine"
     for count in (2, 9):
         command = [sys.executable, "-c", FAULTS, str(count), *shlex.split(line), "--overwrite"]
         found = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
@@ -557,7 +557,7 @@ def test_a_full_disk_is_one_line_and_resume_goes_on(tmp_path, capsys):
 
 
 def test_two_processes_on_one_folder(tmp_path, capsys):
-    line = "sweep --grid 16 12 --horizon 5 --no-refine"
+    line = "sweep --grid 8 8 --horizon 6 --no-refine"
     first = Lock(tmp_path / "jaxmpc-sweep")
     assert run(line) == 2
     assert "another process writes there" in capsys.readouterr().err

@@ -181,7 +181,8 @@ def test_commands_of_tightened_rows_refuse_others(tmp_path, monkeypatch, capsys,
     assert not list(tmp_path.glob("*/*"))
 
 
-@pytest.mark.parametrize("policy", ["affine", "tube"])
+@pytest.mark.parametrize("policy", ["tube", "affine"])
+@pytest.mark.first(1)
 def test_export_command(tmp_path, monkeypatch, policy):
     """C code of plans under a policy, whose closed loops are not looked at."""
     monkeypatch.chdir(tmp_path)
@@ -196,6 +197,7 @@ def test_export_command(tmp_path, monkeypatch, policy):
 
 
 @pytest.mark.parametrize("policy", ["affine", "tube"])
+@pytest.mark.first(1)
 def test_sweep_and_verify_commands(tmp_path, monkeypatch, capsys, policy):
     """A sweep by two shards, begun again with another grid; a problem of another configuration is
     found."""

@@ -75,7 +75,7 @@ def summary_of(line, capsys, code=0):
 
 def test_json_of_verify_has_the_fields_of_a_verification(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    counts = summary_of("sweep --grid 8 8 --horizon 5 --output map", capsys)["counts"]
+    counts = summary_of("sweep --grid 8 8 --horizon 6 --output map", capsys)["counts"]
     found = summary_of("verify map", capsys)
     assert found.keys() == {"passed"} | {f.name for f in dataclasses.fields(Verification)}
     assert found["passed"] and found["verified"] == 64 and not found["failures"]

@@ -23,14 +23,14 @@ from jaxmpc.store.writing import Lock
 def _in_empty_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "100")
-    monkeypatch.setattr(stored, "CHUNK", 200)
+    monkeypatch.setattr(stored, "CHUNK", 64)
 
 
 def run(line):
     return cli.main(shlex.split(line))
 
 
-LINE = "sweep --grid 40 30 --horizon 5"  # 7 blocks of up to 6 rows
+LINE = "sweep --grid 40 10 --horizon 6"  # 7 blocks of up to 6 rows
 
 
 def assert_same(first, second):
@@ -74,12 +74,12 @@ def test_shards_of_any_split_make_what_one_process_makes(whole, tmp_path, monkey
 
 def test_shards_have_smaller_blocks_of_the_same_parts(tmp_path, monkeypatch, capsys):
     """So that each has some to do; one process goes on with them as they are."""
-    monkeypatch.setattr(batches, "CHUNK", 90)
-    monkeypatch.setattr(stored, "CHUNK", 90)
-    assert run("sweep --grid 100 30 --horizon 5 --output whole") == 0
-    assert run("sweep --grid 100 30 --horizon 5 --output out --shard 2/3") == 0
+    monkeypatch.setattr(batches, "CHUNK", 30)
+    monkeypatch.setattr(stored, "CHUNK", 30)
+    assert run("sweep --grid 100 10 --horizon 6 --output whole") == 0
+    assert run("sweep --grid 100 10 --horizon 6 --output out --shard 2/3") == 0
     assert "shard 2/3 with 11 of 34 blocks" in capsys.readouterr().out
-    assert run("sweep --grid 100 30 --horizon 5 --output out --resume") == 0
+    assert run("sweep --grid 100 10 --horizon 6 --output out --resume") == 0
     assert len(xr.open_zarr("whole/sweep.zarr")["checksum"]) == 9
     assert len(xr.open_zarr("out/sweep.zarr")["checksum"]) == 34
     assert_same_arrays("out/sweep.zarr", "whole/sweep.zarr")
@@ -94,7 +94,7 @@ def test_refusals_and_resume(tmp_path, monkeypatch, capsys):
         (f"{LINE} --shard 0/2 --overwrite", "overwrite: given beside shard"),
         (f"{LINE} --shard 2/2", "--shard 2/2: shard 2 of 2. Give i/n"),
         (f"{LINE} --shard auto", "--shard auto: SLURM_ARRAY_TASK_ID, _MIN and _COUNT"),
-        ("sweep --grid 40 30 --horizon 4 --shard 0/2", "mpc.horizon: 5 there, 4 here"),
+        ("sweep --grid 40 10 --horizon 4 --shard 0/2", "mpc.horizon: 6 there, 4 here"),
         (LINE, "exists. Add --resume"),
         ("sweep --robot pendulum --shard 0/2", "--shard: given beside --robot"),
     ):
@@ -107,7 +107,7 @@ def test_refusals_and_resume(tmp_path, monkeypatch, capsys):
     held.release()
     # One process goes on with what shards have left.
     assert run(f"{LINE} --output out --resume") == 0
-    assert "for 660 QPs" in capsys.readouterr().out
+    assert "for 220 QPs" in capsys.readouterr().out
 
 
 @pytest.mark.slow
