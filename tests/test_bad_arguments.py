@@ -769,13 +769,21 @@ def test_grids_take_numbers_for_all_axes():
     np.testing.assert_array_equal(jm.grid(-1, [1, 2], (2, 3)), jm.grid([-1, -1], [1, 2], [2, 3]))
 
 
+LIGHT = jm.ADMM(newton_steps=0)
+
+
+def of_one_state(inputs):
+    return jm.MPC(jm.LinearSystem([[0.9]], [1.0]), 1.0, 1.0, horizon=2, inputs=inputs)
+
+
 def test_masked_arrays_that_hide_nothing_are_arrays():
-    box = jm.Box(np.ma.array([-1, -1]), np.ma.array([1.0, 1.0]))
-    plan = jm.solve(mpc(states=box), np.ma.array(x), solver=jm.ADMM(newton_steps=0))
+    box = jm.Box(np.ma.array([-1]), np.ma.array([1.0]))
+    plan = jm.solve(of_one_state(box), np.ma.array([0.0]), solver=LIGHT)
     np.testing.assert_array_equal(plan.states, 0)
     assert not isinstance(box.upper, np.ma.MaskedArray)
 
 
+@pytest.mark.slow
 def test_lists_are_states_of_fractions():
     with jax.enable_x64(True):
         assert fraction([[0, 0], [1, 1]]) == fraction(np.array([[0.0, 0], [1, 1]]))
@@ -787,8 +795,7 @@ def test_of_no_points_there_are_no_distances():
 
 
 def test_numbers_are_states_where_there_is_one():
-    one = jm.MPC(jm.LinearSystem([[0.9]], [1.0]), 1.0, 1.0, horizon=2, inputs=jm.Box(-1, 1))
-    plans = [jm.solve(one, x0, solver=jm.ADMM(newton_steps=0)) for x0 in (0.5, [0.5])]
+    plans = [jm.solve(of_one_state(jm.Box(-1, 1)), x0, solver=LIGHT) for x0 in (0.5, [0.5])]
     np.testing.assert_array_equal(plans[0].states, plans[1].states)
 
 

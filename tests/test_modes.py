@@ -133,7 +133,8 @@ def test_a_batch_on_a_mesh_with_explicit_axes_that_is_not_the_context():
 
 
 def of_constants():
-    """Programs of x whose other data are arrays of JAX that are made before."""
+    """Programs of x whose other data are arrays of JAX that are made before, several of them in
+    the first."""
     one, two, eye, gain = jnp.ones(1), jnp.zeros(2), jnp.eye(2), jnp.zeros((1, 2))
     none = jnp.zeros((2, 2))
     inputs, disturbance, nine = jm.Box(-one, one), jm.Box(-one, one), jnp.array(9.0)
@@ -142,26 +143,37 @@ def of_constants():
     first = lambda data: data[0][:1]
     task = Task(first, weight=one, target=one, lower=-one, upper=one, rho=nine)
     with_x = lambda x, **more: jm.solve(problem(system=moves, inputs=inputs, **more), x).inputs
+    robust = dict(disturbance=disturbance, disturbance_matrix=0.01 * B)
     return {
-        "gain": partial(with_x, prestabilise=gain),
-        "no gain": partial(with_x, prestabilise=gain, control_horizon=2),
-        "disturbance": partial(with_x, disturbance=disturbance, disturbance_matrix=0.01 * B),
-        "center": partial(with_x, terminal_set=jm.Ellipsoid(eye, nine, center=two)),
-        "rates": partial(with_x, input_rate_limit=one, input_rate_weight=one),
-        "soft": lambda x: jm.solve(jm.soften(problem(system=moves), nine), x, two).inputs,
-        "outputs": partial(with_x, outputs=jm.Outputs(eye, -nine * jnp.ones(2))),
+        "several": partial(
+            with_x,
+            prestabilise=gain,
+            terminal_set=jm.Ellipsoid(eye, nine, center=two),
+            input_rate_limit=one,
+            input_rate_weight=one,
+            outputs=jm.Outputs(eye, -nine * jnp.ones(2)),
+        ),
+        "stages": lambda x: solve_stagewise(problem(system=moves, inputs=inputs), x).inputs,
         "nonlinear": lambda x: (
             solve_nonlinear(
                 NonlinearMPC(problem(inputs=inputs), lambda x, u: A @ x + B @ u, (task,)), x
             ).inputs
         ),
-        "stages": lambda x: solve_stagewise(problem(system=moves, inputs=inputs), x).inputs,
+        "disturbance": partial(with_x, control_horizon=2, **robust),
+        "gain": partial(with_x, prestabilise=gain),
+        "no gain": partial(with_x, prestabilise=gain, control_horizon=2),
+        "disturbance alone": partial(with_x, **robust),
+        "center": partial(with_x, terminal_set=jm.Ellipsoid(eye, nine, center=two)),
+        "rates": partial(with_x, input_rate_limit=one, input_rate_weight=one),
+        "soft": lambda x: jm.solve(jm.soften(problem(system=moves), nine), x, two).inputs,
+        "outputs": partial(with_x, outputs=jm.Outputs(eye, -nine * jnp.ones(2))),
         "qp": lambda x: jm.solve_qp(replace(qp, q=x)).z,
         "linear program": lambda x: jm.solve_qp(replace(qp, q=x, P=none)).z,
     }
 
 
 @pytest.mark.parametrize("name", of_constants())
+@pytest.mark.first(4)
 def test_constants_inside_jit_may_be_arrays_of_jax(name):
     """Operations on them are traced there: what is asked of their values is asked of NumPy."""
     with jax.enable_x64(True):

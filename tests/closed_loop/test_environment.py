@@ -2,6 +2,7 @@
 closed loops."""
 
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -40,14 +41,20 @@ def rollout(environment, policy, keys, steps):
     return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), start, rest)
 
 
-def test_the_return_is_minus_the_cost_of_the_closed_loop():
-    """The policy in the environment is the loop of `simulate`; starts are uniform; an episode ends
-    at its length, or where a limit is exceeded."""
+@pytest.fixture(scope="module")
+def linear():
+    """An environment of a linear plant."""
     system = jm.LinearSystem(np.array([[1, 0.1], [0, 1]]), np.array([[0.02], [0.2]]), dt=0.1)
     plant = jm.LinearPlant(system, jm.Box([-0.5, -0.2], [0.5, 0.2]), jm.Box([-0.5], [0.5]))
     options = dict(Q=[5.0, 0.2], R=[0.1], spread=0.9, length=12, stop_at_limits=True)
-    environment = Environment.of(plant, [0.1, 0.0], **options)
-    mpc = jm.MPC(system, environment.Q, environment.R, 2, inputs=plant.input_limits)
+    return Environment.of(plant, [0.1, 0.0], **options)
+
+
+def test_the_return_is_minus_the_cost_of_the_closed_loop(linear):
+    """The policy in the environment is the loop of `simulate`; starts are uniform; an episode ends
+    at its length, or where a limit is exceeded."""
+    environment, plant = linear, linear.robot
+    mpc = jm.MPC(plant.system, environment.Q, environment.R, 2, inputs=plant.input_limits)
     law = LinearFeedback(mpc, [[-3.0, -2.0]], plant)
     run = jax.jit(lambda keys: rollout(environment, environment.policy(law), keys, 12))
     keys = jax.random.split(jax.random.key(0), 200)
@@ -67,6 +74,27 @@ def test_the_return_is_minus_the_cost_of_the_closed_loop():
     np.testing.assert_array_equal(run(keys).x, found.x)
 
 
+def test_limits_nan_and_other_plants(linear):
+    """Actions are clipped; a state that is not finite ends its episode alone; plants differ."""
+    plant, B = linear.robot, np.array([[[0.02], [0.2]]]) * np.array([1.0, 1.0, 2.0])[:, None, None]
+
+    @jax.jit
+    @partial(jax.vmap, in_axes=(0, None, 0))
+    def after(x, action, B):
+        varied = replace(linear, robot=plant.vary(B=B))
+        return varied.step(varied.at(x), action)
+
+    x = np.array([[0.3, 0.0], [np.nan, 0.0], [0.499, 0.199]])
+    found = jax.tree.map(np.asarray, after(x, np.array([9.0]), B))
+    assert list(found.terminated) == [False, True, True]
+    at_limit = jax.tree.map(np.asarray, after(x, np.array([0.5]), B))
+    np.testing.assert_array_equal(found.x, at_limit.x)
+    np.testing.assert_array_equal(found.reward, at_limit.reward)
+    wanted = x @ plant.system.A.T + 0.5 * B[..., 0]
+    np.testing.assert_allclose(found.x[[0, 2]], wanted[[0, 2]], rtol=1e-12)
+
+
+@pytest.mark.slow
 def test_limits_nan_and_random_plants(environment):
     """Actions are clipped; a state that is not finite ends its episode alone; plants differ."""
     robot = environment.robot

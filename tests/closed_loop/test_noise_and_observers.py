@@ -149,10 +149,13 @@ def test_delay_is_the_augmented_state(compensate):
         np.testing.assert_allclose(np.sort_complex(np.linalg.eigvals(loop)), poles, atol=1e-9)
 
 
-def test_delayed_mpc_with_filter_and_moving_references():
+@pytest.mark.parametrize("kind", ["law", pytest.param("plans", marks=pytest.mark.slow)])
+def test_delayed_loops_with_filter_and_moving_references(kind):
     """Under perfect prediction the delayed loop is the one without delay, a sample later, also for
     references over time and through an observer."""
-    controller = jm.Controller(MPC, jm.ADMM(iterations=200, newton_steps=0))
+    controller = LAW
+    if kind == "plans":
+        controller = jm.Controller(MPC, jm.ADMM(iterations=200, newton_steps=0))
     x0, u0 = np.array([0.4, -0.1]), np.array([0.3])
     r = np.stack([np.sin(np.arange(20 + 3) / 5), np.zeros(23)], axis=1)
     s = 0.1 * np.cos(np.arange(20 + 2))[:, None]
@@ -236,7 +239,7 @@ def test_not_finite_stays_in_its_row(gaussian):
     """Also in the derivative with respect to the starts."""
     x0s = np.zeros((3, 2))
     x0s[1] = np.nan
-    run = jm.simulate_many(LAW, SYSTEM, x0s, STEPS, noise=NOISE, observer=FILTER)
+    run = jm.simulate_many(LAW, SYSTEM, x0s, STEPS, chunk=2, noise=NOISE, observer=FILTER)
     assert np.isnan(run.states[1]).all() and np.isnan(run.estimates[1]).all()
     np.testing.assert_allclose(run.states[[0, 2]], gaussian.states[[0, 2]], atol=1e-12)
 

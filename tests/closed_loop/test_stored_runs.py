@@ -15,7 +15,7 @@ from jaxmpc.closed_loop import (
 )
 from jaxmpc.closed_loop.variations import plant_numbers
 
-STEPS = 30
+STEPS = 400
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +49,7 @@ def test_runs_are_stored_resumed_and_those_of_simulate_many(tmp_path, monkeypatc
     monkeypatch.setattr(stored_runs, "simulate_many", real)
     with pytest.raises(ValueError, match="exists"):
         simulate_into(path, feedback, joint, x0s, STEPS, **options)
-    with pytest.raises(ValueError, match="steps: 30 there, 29 here"):
+    with pytest.raises(ValueError, match="steps: 400 there, 399 here"):
         simulate_into(path, feedback, joint, x0s, STEPS - 1, resume=True, **options)
     other = LinearFeedback(feedback.mpc, 2 * feedback.K, joint)
     with pytest.raises(ValueError, match="data: "):
@@ -74,8 +74,9 @@ def test_runs_are_stored_resumed_and_those_of_simulate_many(tmp_path, monkeypatc
 
 def test_summary_says_what_the_states_say(joint, feedback):
     """Of runs that no store holds: without settings, and without the time they took."""
-    x0s, _ = draw_robots(joint, 5, seed=1)
-    run = simulate_many(feedback, joint, x0s, 400)
+    x0s, factors = draw_robots(joint, 5, seed=1, mass=0.2)
+    numbers = plant_numbers(joint, factors)
+    run = simulate_many(feedback, joint, x0s, STEPS, variations=numbers, chunk=3)
     summary = summarise_runs(run, joint, np.zeros(2), np.zeros(1))
     outcome = jm.closed_loop.evaluate_runs(run, joint, np.zeros(2))
     assert summary.data["success"] == np.count_nonzero(outcome.success)

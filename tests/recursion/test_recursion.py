@@ -38,6 +38,7 @@ def settled(mpc):
 
 
 @pytest.mark.parametrize("seed", range(8))
+@pytest.mark.first(2)
 def test_inputs_with_limits_through_zero_and_rates(seed):
     """Supports of X_N along coordinates are often zero there, or what rounding leaves of that; they
     are those of linear programs over (x, u_{-1}, u_0, u_1), and the weak claim is settled."""

@@ -347,7 +347,8 @@ def box_support(box, d):
     return np.where(d == 0, 0.0, ends).sum(axis=1)
 
 
-def test_images_and_sums_of_unbounded_sets_have_the_supports_of_their_parts():
+@pytest.mark.parametrize("count", [8, pytest.param(40, marks=pytest.mark.slow)])
+def test_images_and_sums_of_unbounded_sets_have_the_supports_of_their_parts(count):
     """What rounding leaves in rows and rays must not bound a set that nothing else bounds."""
     rng = np.random.default_rng(0)
 
@@ -356,7 +357,7 @@ def test_images_and_sums_of_unbounded_sets_have_the_supports_of_their_parts():
         free = rng.uniform(size=(2, n))
         return Box(np.where(free[0] < 0.5, -np.inf, lower), np.where(free[1] < 0.3, np.inf, upper))
 
-    for k in range(40):
+    for k in range(count):
         box, M, d = unbounded(3), rng.normal(size=(2, 3)), rng.normal(size=(6, 2))
         size = 10.0 ** rng.uniform(-2, 2, 3)
         M[1] = M[0] if k % 2 else M[1]  # of half of them the image is flat

@@ -205,13 +205,17 @@ def possible(kind, shape):
     return kind != "Zonotope" or shape in ("full", "flat", "point")
 
 
+# A box is a polytope to most operations: three shapes of it are enough by default.
+REPEATED = [("Box", shape) for shape in ("flat", "point", "flat and unbounded")]
+REPEATED += [("Zonotope", "full")]
+
 CASES = [
     pytest.param(
         kind,
         shape,
         unit,
         id=f"{kind}, {shape}, units {unit}",
-        marks=[pytest.mark.slow] if unit == "1" else [],
+        marks=[pytest.mark.slow] if unit == "1" or (kind, shape) in REPEATED else [],
     )
     for kind, shape, unit in itertools.product(KINDS, SHAPES, UNITS)
     if possible(kind, shape)

@@ -42,6 +42,7 @@ def test_damped_steps_solve_their_equations():
     np.testing.assert_allclose(np.abs(steps).max(axis=1)[0], LARGEST)
 
 
+@pytest.mark.slow
 def test_hidden_weights_are_found_in_a_few_steps():
     """From the trajectories of an expert, inputs at their limits among them: 16 digits of the loss
     where a step of Adam gains a few per cent; weights are determined up to a common factor."""

@@ -88,21 +88,35 @@ class Outside:
         return jax.pure_callback(valve, jax.typeof(x), x, u, vmap_method="expand_dims")
 
 
-def tuned(x0s, **more):
-    make = lambda v: replace(MPC, Q=v["Q"], R=v["R"], terminal_cost=v["Q"])
-    settings = {"updates": 12, "optimizer": optax.adam(0.2), "solver": SOLVER, **more}
-    return tune_weights(make, PARAMETERS, Outside(), x0s, LOSS, 25, **settings)
+def weighed(v):
+    return replace(MPC, Q=v["Q"], R=v["R"], terminal_cost=v["Q"])
+
+
+def tuned(x0s, make=weighed, parameters=PARAMETERS, **more):
+    settings = {"updates": 12, "optimizer": optax.adam(0.2), **more}
+    return tune_weights(make, parameters, Outside(), x0s, LOSS, 25, **settings)
 
 
 def draw(seed):
     return np.random.default_rng(seed).uniform(-1, 1, (24, 2))
 
 
-def test_a_plant_outside_jax_that_rounds_inputs_and_sticks():
+# What is tuned: weights of plans, or gains of a law, which compiles in a moment.
+TUNED = {
+    "law": dict(
+        make=lambda v: jm.closed_loop.LinearFeedback(MPC, v["K"][None]),
+        parameters={"K": Parameter([-0.3, -0.3])},
+    ),
+    "plans": dict(solver=SOLVER),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", ["law", pytest.param("plans", marks=pytest.mark.slow)])
+def test_a_plant_outside_jax_that_rounds_inputs_and_sticks(kind):
     """Derivatives are refused before a compile; samples gain on unseen starts."""
     with pytest.raises(ValueError, match=r'mode: forward, reverse.*JVP.*mode="sampling"'):
-        tuned(draw(0))
-    found = tuned(draw(0), mode="sampling")
+        tuned(draw(0), **TUNED[kind])
+    found = tuned(draw(0), mode="sampling", **TUNED[kind])
     assert found.settings["mode"] == "sampling" and found.history.accepted.all()
 
     control = jax.jit(jax.vmap(lambda values, x: found.build(values)(x).u, (None, 0)))
@@ -111,7 +125,7 @@ def test_a_plant_outside_jax_that_rounds_inputs_and_sticks():
         """The loops again, without `simulate`."""
         x, losses = draw(1), []
         for _ in range(25):
-            u = np.asarray(control(values, x))
+            u = np.clip(np.asarray(control(values, x)), -1, 1)
             losses.append(x**2 @ [1.0, 0.1] + 0.01 * u[:, 0] ** 2)
             x = valve(x, u)
         return np.mean(losses)
@@ -123,9 +137,9 @@ def test_a_plant_outside_jax_that_rounds_inputs_and_sticks():
 def test_a_run_by_samples_that_is_cut_off_goes_on_as_if_it_had_not_been(tmp_path):
     x0s, path = draw(0), tmp_path / "run.npz"
     x0s[3] = np.nan  # a loop that is left out
-    tuned(x0s, mode="sampling", updates=3, checkpoint=path)
-    again = tuned(x0s, mode="sampling", updates=6, checkpoint=path).history
-    whole = tuned(x0s, mode="sampling", updates=6).history
+    tuned(x0s, mode="sampling", solver=SOLVER, updates=3, checkpoint=path)
+    again = tuned(x0s, mode="sampling", solver=SOLVER, updates=6, checkpoint=path).history
+    whole = tuned(x0s, mode="sampling", solver=SOLVER, updates=6).history
     np.testing.assert_array_equal(again.thetas["Q"], whole.thetas["Q"])
     assert whole.numbers["excluded"].tolist() == [1.0] * 6 and whole.accepted.all()
 

@@ -380,18 +380,20 @@ def test_training_and_validation_have_the_conditions_of_simulate(x64):
     np.testing.assert_allclose(sorted(found), sorted(wanted), rtol=1e-9)
 
 
-def test_loops_have_the_conditions_of_simulate(x64):
+@pytest.mark.parametrize("kind", ["law", pytest.param("plans", marks=pytest.mark.slow)])
+def test_loops_have_the_conditions_of_simulate(x64, kind):
     """A delay, a disturbance and noise: the losses are those of `simulate_many` under the same."""
     x0s, start = starts(6), {k: v.value for k, v in PARAMETERS.items()}
+    made = lambda v: jm.Controller(weighed(v), SOLVER)
+    if kind == "law":
+        made = lambda v: jm.closed_loop.LinearFeedback(MPC, -v["R"] @ v["Q"][:1])
     conditions = {"delay": 1, "noise": NOISE, "disturbance": np.tile([0.0, 0.01], (8, 1))}
     objective = ClosedLoopObjective(
-        lambda v: jm.Controller(weighed(v), SOLVER), PARAMETERS, SYSTEM, 8, LOSS, None, None, None,
-        conditions,
+        made, PARAMETERS, SYSTEM, 8, LOSS, None, None, None, conditions
     )  # fmt: skip
     theta = {k: v.raw() for k, v in PARAMETERS.items()}
     found = jax.jit(lambda theta: objective.total(theta, SYSTEM, x0s, {}, np.ones(6))[1])(theta)
-    at_start = jm.Controller(weighed(start), SOLVER)
-    run = jm.closed_loop.simulate_many(at_start, SYSTEM, x0s, 8, **conditions)
+    run = jm.closed_loop.simulate_many(made(start), SYSTEM, x0s, 8, **conditions)
     losses = jax.vmap(LOSS)(jax.tree.map(jnp.asarray, run))
     np.testing.assert_allclose(found["losses"], losses, rtol=1e-9)
 
