@@ -48,8 +48,8 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 
 # Each kernel of a compiled program keeps some memory maps, of which a process may have 65,530 (one
-# more, and it ends by SIGSEGV). A module adds up to 30,000.
-MAPS = 15_000
+# more, and it ends by SIGSEGV). A module adds up to 30,000, of fast tests up to 3,000.
+MAPS = 30_000
 
 
 def pytest_configure(config):

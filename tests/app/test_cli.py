@@ -495,8 +495,9 @@ def test_init_writes_a_problem_that_every_command_reads(capsys):
 
 @pytest.mark.parametrize(
     "line",
-    ["--help", "--version", "swep", "sweep --help", "tune weights --wrong", "simulate --count 0"],
+    ["sweep --help", "swep", "tune weights --wrong", "--help", "--version", "simulate --count 0"],
 )
+@pytest.mark.first(3)
 def test_help_version_and_wrong_options_do_without_jax(line):
     code = (
         "import sys; from jaxmpc.app import cli\n"

@@ -51,6 +51,7 @@ def test_shares_of_a_clipped_gain_are_areas():
 
 
 @pytest.mark.parametrize("seed", range(3))
+@pytest.mark.first(1)
 def test_many_states_agree(seed):
     """No state of a proved cell misses the target, none of a refuted one keeps it, and the shares
     enclose that of random states."""
@@ -63,6 +64,7 @@ def test_many_states_agree(seed):
 
 
 @pytest.mark.parametrize("seed", range(4))
+@pytest.mark.first(2)
 def test_bounds_hold_in_a_cell(seed):
     """Bounds enclose what 2,000 states of a random simplex have, and are sharp in small ones."""
     random = np.random.default_rng(seed)

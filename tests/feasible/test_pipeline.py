@@ -217,10 +217,9 @@ class TestLastPrograms:
 
     def test_flat_sets(self):
         """Without a centre the margin alone is left."""
-        still = problems.symmetric(0.0)
-        flat = FeasibilityProblem.of(replace(scalar().mpc, states=still, terminal_set=still))
+        flat = FeasibilityProblem.of(problems.scalar(horizon=4, x_max=0.0, terminal=0.0))
         assert len(list(last_programs(flat, np.ones(len(flat.rows.U))))) == 1
-        (part,) = label_chunks(flat, np.array([[0.0], [0.4]]))
+        (part,) = label_chunks(flat, np.array([[0.0], [0.1]]))
         labels = part.result
         assert labels.label[0] >= 0 and labels.label[1] == -1
 

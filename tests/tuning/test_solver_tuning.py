@@ -15,7 +15,11 @@ from jaxmpc.tuning.solver import interpolation, loss_and_gradient, transfer_pena
 
 # The double integrator of five steps: 5 variables, 17 rows.
 DEFAULT = jm.ADMM(rho=1.0, alpha=1.6, newton_steps=0)
-SETTINGS = {"iterations": 30, "stages": 2, "updates": 40, "batch": 32, "solver": DEFAULT}
+# What is followed and from where is given, so that all programs here have the same arguments.
+SETTINGS = {
+    "iterations": 30, "stages": 2, "updates": 40, "batch": 32, "solver": DEFAULT,
+    "reference": np.zeros(2), "warm_start": (np.zeros((160, 5)), np.zeros((160, 17))),
+}  # fmt: skip
 
 
 def mpc(horizon=5):
@@ -61,10 +65,10 @@ def test_more_states_are_solved_on_others(learned):
 def test_gradient_against_differences():
     """Of the loss with respect to log rho and alpha, with warm starts and a reference."""
     rng = np.random.default_rng(0)
-    x, rows = states(12, 2), len(jm.mpc.row_table(mpc()))
-    start = rng.normal(size=(12, 5)), rng.normal(size=(12, rows))
+    x, rows = states(64, 2), len(jm.mpc.row_table(mpc()))
+    start = rng.normal(size=(64, 5)), rng.normal(size=(64, rows))
     references = np.array([0.3, 0.1]), None
-    objective = tuning_solver._objective(mpc(), 20, 2, "step", DEFAULT, references)
+    objective = tuning_solver._objective(mpc(), 30, 2, "step", DEFAULT, references)
     given = objective.condensed, x, start, Settings(validation=0.5)
     samples, _ = tuning_solver._samples(mpc(), *given)
     parameters = objective.W.shape[1]

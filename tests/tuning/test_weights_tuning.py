@@ -33,7 +33,7 @@ MPC = jm.MPC(
 NOISE = jm.closed_loop.Noise(process=0.01, seed=3)
 SOLVER = jm.ADMM(iterations=80, newton_steps=0, eps=1e-3)  # compiles fastest
 LOSS = ClosedLoopLoss(np.diag([4.0, 0.5]), [0.02], limits=LIMITS, violation=5.0)
-PARAMETERS = {"Q": Parameter(MPC.Q / 4, "definite"), "R": Parameter(10 * MPC.R, "diagonal")}
+PARAMETERS = {"Q": Parameter(MPC.Q / 4, "definite"), "R": Parameter(40 * MPC.R, "diagonal")}
 
 
 def weighed(v):
@@ -55,9 +55,19 @@ def x64():
         yield
 
 
+def regulated(v):
+    """The LQR of these weights, which compiles in a moment."""
+    return jm.closed_loop.LinearFeedback(weighed(v), jm.lqr(SYSTEM, v["Q"], v["R"]).K)
+
+
+@pytest.fixture(scope="module", params=["law", pytest.param("plans", marks=pytest.mark.slow)])
+def make(request):
+    return {"law": regulated, "plans": weighed}[request.param]
+
+
 @pytest.fixture(scope="module")
-def tuned(x64):
-    return tune(loss=LOSS, updates=12, batch=8, optimizer=optax.adam(0.2))
+def tuned(x64, make):
+    return tune(make=make, loss=LOSS, updates=12, batch=8, optimizer=optax.adam(0.2))
 
 
 def test_validation_loss_falls_and_is_that_of_the_returned_values(tuned):
@@ -72,7 +82,9 @@ def test_validation_loss_falls_and_is_that_of_the_returned_values(tuned):
     np.testing.assert_array_equal(tuned.mpc.Q, tuned.values["Q"])
     record = tuned.record()
     np.testing.assert_allclose(record["values_by_step"]["Q"][history.best], tuned.values["Q"])
-    assert record["numbers"]["unsolved"] == [0.0] * 12 and record["settings"]["mode"] == "forward"
+    laws = isinstance(tuned.result, jm.closed_loop.LinearFeedback)  # without plans
+    assert record["numbers"]["unsolved"] == [float(laws)] * 12
+    assert record["settings"]["mode"] == "forward"
 
 
 def test_a_run_prints_what_changed(tuned):
@@ -97,10 +109,11 @@ def test_losses_that_cannot_be_traced_are_named(x64):
 
 
 @pytest.mark.slow
-def test_reverse_mode_checkpoint_and_forward_mode_agree(tuned, tmp_path):
+def test_reverse_mode_checkpoint_and_forward_mode_agree(tuned, make, tmp_path):
     """The same run by the transposed derivative, cut off and taken up again."""
     path = tmp_path / "run.npz"
     same = {"loss": LOSS, "batch": 8, "optimizer": optax.adam(0.2), "mode": "reverse"}
+    same["make"] = make
     tune(updates=2, checkpoint=path, **same)
     again = tune(updates=5, checkpoint=path, **same)
     np.testing.assert_allclose(again.history.loss, tuned.history.loss[:5], rtol=1e-8)
@@ -110,7 +123,7 @@ def test_reverse_mode_checkpoint_and_forward_mode_agree(tuned, tmp_path):
         tune(updates=5, checkpoint=path, **{**same, "batch": 4})
 
 
-def test_an_interrupt_gives_the_best_so_far(tuned, monkeypatch):
+def test_an_interrupt_gives_the_best_so_far(tuned, make, monkeypatch):
     """Ctrl-C in the sixth of twelve steps: what these gave, for the plan of `tuned`."""
     real = weights.descend
 
@@ -124,7 +137,7 @@ def test_an_interrupt_gives_the_best_so_far(tuned, monkeypatch):
 
     monkeypatch.setattr(weights, "descend", descend)
     with pytest.raises(KeyboardInterrupt) as stop:
-        tune(loss=LOSS, updates=12, batch=8, optimizer=optax.adam(0.2))
+        tune(make=make, loss=LOSS, updates=12, batch=8, optimizer=optax.adam(0.2))
     run = stop.value.run
     np.testing.assert_array_equal(run.history.validation, tuned.history.validation[:6])
     assert run.improved and run.result.mpc.Q.shape == (2, 2)
@@ -174,6 +187,18 @@ def test_design_loss_references_and_other_fields(x64):
     assert np.all(np.diff(goal) > 0)  # towards 0.3
     assert found.values["tight"] > 0.05  # narrower limits lower the design loss
     assert found.values["goal"][1] == 0.0
+
+
+def test_a_loss_of_plans_has_a_gradient_in_a_trace(x64):
+    """What `test_validation_loss_falls...` compiles in the slow tests."""
+    objective = ClosedLoopObjective(
+        lambda v: jm.Controller(weighed(v), SOLVER), PARAMETERS, SYSTEM, 8, LOSS, None, None, None,
+        {},
+    )  # fmt: skip
+    theta = {k: v.raw() for k, v in PARAMETERS.items()}
+    total = lambda theta: objective.total(theta, SYSTEM, starts(8), {}, np.ones(8))[0]
+    slope = jax.eval_shape(jax.grad(total), theta)
+    assert {name: v.shape for name, v in slope.items()} == {"Q": (3,), "R": (1,)}
 
 
 def test_operations_are_counted_without_compiling():

@@ -88,7 +88,8 @@ def test_proves_labels_of_rates_and_blocks(tmp_path, policy, fields):
     assert result.verified == result.exactly == np.count_nonzero(label)
 
 
-@pytest.mark.parametrize("policy", ["affine", "tube"])
+@pytest.mark.parametrize("policy", ["tube", "affine"])
+@pytest.mark.first(1)
 def test_finds_what_is_wrong(tmp_path, policy, monkeypatch):
     """A wrong label of either kind, a wrong cone or plan; a policy that breaks a limit makes wrong
     whatever rests on it."""
