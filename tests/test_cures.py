@@ -49,25 +49,30 @@ def test_a_number_weighs_the_rate_of_one_input():
 
 
 def test_points_of_a_map_with_limited_rates():
-    """The message names the columns that are missing; with them the map is made."""
+    """The message names the columns that are missing."""
     mpc = problem(input_rate_limit=0.2)
     with pytest.raises(ValueError, match=r"points \(B, 3\): states, then previous inputs"):
         jm.map_feasible_set(mpc, np.zeros((3, 2)))
-    assert jm.map_feasible_set(mpc, np.zeros((3, 3))).label.tolist() == [1, 1, 1]
-
     slice_ = r"map a slice: axes=\[0, 1\], fixed=\[0\]"
     with pytest.raises(ValueError, match=slice_):
         jm.map_feasible_set(mpc, np.zeros((3, 2)))
+    with pytest.raises(
+        ValueError, match=r"fixed: shape \(2,\).*each of previous u1, \(1,\), or of all"
+    ):
+        jm.map_feasible_set(mpc, np.zeros((3, 2)), axes=[0, 1], fixed=[0, 0])
+
+
+@pytest.mark.slow
+def test_maps_with_limited_rates_as_the_messages_ask():
+    """With the columns that they name the map is made."""
+    mpc = problem(input_rate_limit=0.2)
+    assert jm.map_feasible_set(mpc, np.zeros((3, 3))).label.tolist() == [1, 1, 1]
     short, whole = (
         jm.map_feasible_set(mpc, np.zeros((3, 2)), axes=[0, 1], fixed=fixed)
         for fixed in ([0.1], [7, 7, 0.1])
     )
     np.testing.assert_array_equal(short.fixed, [0, 0, 0.1])
     np.testing.assert_array_equal(whole.fixed, short.fixed)
-    with pytest.raises(
-        ValueError, match=r"fixed: shape \(2,\).*each of previous u1, \(1,\), or of all"
-    ):
-        jm.map_feasible_set(mpc, np.zeros((3, 2)), axes=[0, 1], fixed=[0, 0])
     meaning = short.to_xarray().bound_normal.attrs["long_name"]
     assert meaning == "a of a half-space a'x <= b that holds all feasible states"
 

@@ -538,7 +538,8 @@ def test_a_full_disk_is_named_before_the_sweep_starts(refused, monkeypatch):
     )
 
 
-@pytest.mark.parametrize("line", ["sweep --horizont 3", "sweep --horizon 1000000000"])
+@pytest.mark.parametrize("line", ["sweep --horizon 1000000000", "sweep --horizont 3"])
+@pytest.mark.first(1)
 def test_the_installed_command_does_the_same(line, tmp_path):
     command = [sys.executable, "-m", "jaxmpc", *line.split()]
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)

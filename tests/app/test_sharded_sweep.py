@@ -171,9 +171,10 @@ SHARD = """
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("kills", [3, pytest.param(50, marks=pytest.mark.slow)])
 @pytest.mark.slow
-def test_kills_at_random_moments(tmp_path, kills):
+def test_kills_at_random_moments(tmp_path, monkeypatch, kills):
     """Two shards side by side, one of them killed at a time: no array differs, and no block is
     computed twice but those in hand."""
+    monkeypatch.setattr(stored, "CHUNK", 200)  # as in SHARD
     grid, delay = ((60, 100), "0.02") if kills == 3 else ((300, 100), "0.1")
     line = f"sweep --grid {grid[0]} {grid[1]} --horizon 4 --no-refine --output".split()
     assert cli.main([*line, "whole"]) == 0

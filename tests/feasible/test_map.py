@@ -272,7 +272,7 @@ class TestMapObject:
         assert nothing.terminal_section() is None
 
 
-@pytest.mark.first(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [0.1, 0.01])
 def test_refine_bounds_thin_tilted_sets(width):
     c, s = np.cos(0.7), np.sin(0.7)

@@ -72,6 +72,7 @@ def check_set(seed):
 
 
 @pytest.mark.parametrize("seed", range(6))
+@pytest.mark.first(2)
 def test_sets_in_other_units(seed):
     check_set(seed)
 
@@ -164,6 +165,7 @@ def check_rounding(seed):
 
 
 @pytest.mark.parametrize("seed", range(6, 12))
+@pytest.mark.first(3)
 def test_rounding_in_rows_changes_no_answer(seed):
     check_rounding(seed)
 
@@ -211,6 +213,7 @@ def check_invariant(seed):
 
 
 @pytest.mark.parametrize("seed", range(2))
+@pytest.mark.first(1)
 def test_invariant_sets_in_other_units(seed):
     check_invariant(seed)
 
