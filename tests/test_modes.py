@@ -118,17 +118,13 @@ def near(one, other):
     jax.tree.map(lambda v, w: np.testing.assert_allclose(v, w, rtol=2e-3, atol=2e-3), one, other)
 
 
-def test_a_plan_is_traced_without_implicit_promotion():
-    """The modes act on what is traced, so that nothing need be compiled here."""
-    with jax.numpy_rank_promotion("raise"), jax.numpy_dtype_promotion("strict"):
-        jax.jit(many("plan")).trace(XS)
-
-
-def test_a_batch_on_a_mesh_with_explicit_axes_that_is_not_the_context():
-    """Arrays have the axes in their type without `jax.set_mesh` too."""
+def test_a_plan_is_traced_without_implicit_promotion_on_a_mesh_that_is_not_the_context():
+    """Arrays have explicit axes in their type without `jax.set_mesh` too. The modes act on what is
+    traced, so that nothing need be compiled here."""
     mesh = jax.make_mesh((1,), ("b",), axis_types=(AxisType.Explicit,))
     batch = jax.device_put(XS, NamedSharding(mesh, PartitionSpec("b")))
-    found = jax.jit(many("plan")).trace(batch).out_info
+    with jax.numpy_rank_promotion("raise"), jax.numpy_dtype_promotion("strict"):
+        found = jax.jit(many("plan")).trace(batch).out_info
     assert found.inputs.shape == (len(XS), 3, 1)
 
 

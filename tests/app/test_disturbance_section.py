@@ -196,8 +196,8 @@ def test_export_command(tmp_path, monkeypatch, policy):
         subprocess.run([compiler, *strict.split()], check=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("policy", ["affine", "tube"])
-@pytest.mark.first(1)
 def test_sweep_and_verify_commands(tmp_path, monkeypatch, capsys, policy):
     """A sweep by two shards, begun again with another grid; a problem of another configuration is
     found."""

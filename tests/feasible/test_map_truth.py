@@ -296,7 +296,8 @@ class TestHiddenProduct:
         for i in np.flatnonzero(fmap.label == 1)[:5]:
             assert exact.keeps_all_rows(problems.hidden_product(), whole[i], fmap.labels.plan[i])
 
-    @pytest.mark.parametrize("axes", [(0, 3), pytest.param((1, 2), marks=pytest.mark.slow)])
+    @pytest.mark.slow
+    @pytest.mark.parametrize("axes", [(0, 3), (1, 2)])
     def test_projection(self, blocks, axes):
         """Exact projection: the hull of the projected vertices."""
         shadow = exact.hull([tuple(exact.rational(p)) for p in corners(blocks)[:, list(axes)]])

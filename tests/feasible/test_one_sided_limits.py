@@ -43,7 +43,7 @@ INSIDE = np.array([1.0, 1 - 1e-9, 0.0, -50.0, -1e6])
 
 @pytest.mark.parametrize("none", NONE)
 @pytest.mark.parametrize("sign", [1, -1])
-@pytest.mark.first(1)
+@pytest.mark.slow
 def test_scalar(none, sign):
     """x ≤ 1, or −x ≤ 1 as a mirror: labels, and half-spaces that hold and exclude, exactly."""
     mpc = ceiling(none)

@@ -83,13 +83,20 @@ class TestChunks:
         assert [len(part.label) for part in parts] == [1, 1, 1, 1]
 
     def test_points_that_are_decided_go_no_further(self, monkeypatch):
-        """The first stage runs once a chunk; others only where it leaves points."""
+        """The first stage runs once a chunk; others only where it leaves points, which
+        `TestLastPrograms` follows."""
         run, calls = pipeline._run, []
         monkeypatch.setattr(pipeline, "_run", lambda *args: calls.append(args[0]) or run(*args))
-        easy, hard = np.array([0.0, 2.0, -0.1, -3.0]), np.array([0.0, 2.0, 1.3 - 1e-9, 1.3 + 1e-9])
+        easy = np.array([0.0, 2.0, -0.1, -3.0])
         label = labelled(np.append(easy, np.nan))[2]
         np.testing.assert_array_equal(label[:4], expected(easy))
         assert len(calls) == 1
+
+    @pytest.mark.slow
+    def test_points_that_are_left_go_through_other_stages(self, monkeypatch):
+        run, calls = pipeline._run, []
+        monkeypatch.setattr(pipeline, "_run", lambda *args: calls.append(args[0]) or run(*args))
+        hard = np.array([0.0, 2.0, 1.3 - 1e-9, 1.3 + 1e-9])
         np.testing.assert_array_equal(labelled(hard, iterations=1)[2], expected(hard))
         assert len(calls) > 2 and len(set(calls)) > 2
 

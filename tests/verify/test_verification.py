@@ -96,12 +96,11 @@ def stored(path, mpc, axes, fixed, side=15):
     return labels
 
 
-FAST = ("box", "terminal ellipsoid", "projection")
+FAST = ("projection",)
 NAMES = [v if v in FAST else pytest.param(v, marks=pytest.mark.slow) for v in PROBLEMS]
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.first(1)
 def test_proves_all_labels(tmp_path, name):
     problem, axes, fixed = PROBLEMS[name]
     labels = stored(tmp_path / "sweep.zarr", problem, axes, fixed)
