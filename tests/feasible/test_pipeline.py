@@ -83,8 +83,8 @@ class TestChunks:
         assert [len(part.label) for part in parts] == [1, 1, 1, 1]
 
     def test_points_that_are_decided_go_no_further(self, monkeypatch):
-        """The first stage runs once a chunk; others only where it leaves points, which
-        `TestLastPrograms` follows."""
+        """The first stage runs once a chunk; others only where it leaves points, as
+        the slow tests show."""
         run, calls = pipeline._run, []
         monkeypatch.setattr(pipeline, "_run", lambda *args: calls.append(args[0]) or run(*args))
         easy = np.array([0.0, 2.0, -0.1, -3.0])
@@ -174,6 +174,7 @@ class TestLastPrograms:
         label = labelled(self.POINTS, chunk=chunk)[2]
         np.testing.assert_array_equal(label != 0, first(entries))
 
+    @pytest.mark.slow
     def test_only_what_is_left_counts(self, hide, monkeypatch):
         """Decided points before and after two others are no reason not to run their programs."""
         hide(lambda x: np.isin(x[:, 0], self.POINTS[4:6]))

@@ -73,10 +73,10 @@ def test_limits_of_a_urdf_that_no_motion_keeps_are_refused(tmp_path, given, word
 
 
 def test_contacts_are_left_out_on_request(tmp_path):
-    """And where many meshes could touch, a warning names that."""
+    """What is left falls freely; and where many meshes could touch, a warning names that."""
     body = """<body pos="0 0 {}"><joint type="slide" range="-9 9"/><geom type="mesh" mesh="m"/>
     </body>"""
-    text = f"""<mujoco><option cone="elliptic"/><asset>
+    text = f"""<mujoco><option cone="elliptic" integrator="RK4"/><asset>
     <mesh name="m" vertex="0 0 0  .1 0 0  0 .1 0  0 0 .1"/></asset>
     <worldbody>{"".join(body.format(i) for i in range(4))}<site name="s"/></worldbody>
     <actuator><motor site="s"/></actuator></mujoco>"""
@@ -85,7 +85,10 @@ def test_contacts_are_left_out_on_request(tmp_path):
     robot = jm.load_robot(path, contacts=False)
     assert robot.report().left_out == ("all contacts",)
     x, u = robot.home, np.zeros(1)
-    np.testing.assert_allclose(robot.step(x, u)[4:], -9.81 * robot.dt, rtol=1e-5)
+    after = robot.step(x, u)
+    np.testing.assert_allclose(after[4:], -9.81 * robot.dt, rtol=1e-5)
+    # A fall that this integrator has exactly.
+    np.testing.assert_allclose(after[:4] - x[:4], -9.81 * robot.dt**2 / 2, rtol=1e-3)
     with pytest.warns(UserWarning, match="four has 6 pairs of meshes .* load it with contacts=Fal"):
         _warn_of_meshes("four", mujoco.MjModel.from_xml_path(str(path)))
 
