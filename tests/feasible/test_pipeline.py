@@ -98,7 +98,7 @@ class TestChunks:
         monkeypatch.setattr(pipeline, "_run", lambda *args: calls.append(args[0]) or run(*args))
         hard = np.array([0.0, 2.0, 1.3 - 1e-9, 1.3 + 1e-9])
         np.testing.assert_array_equal(labelled(hard, iterations=1)[2], expected(hard))
-        assert len(calls) > 2 and len(set(calls)) > 2
+        assert len(set(calls)) >= 2
 
     def test_points_that_are_not_finite(self):
         points = np.tile(self.POINTS, 2)
