@@ -109,6 +109,7 @@ def test_losses_that_cannot_be_traced_are_named(x64):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("make", ["plans"], indirect=True)
 def test_reverse_mode_checkpoint_and_forward_mode_agree(tuned, make, tmp_path):
     """The same run by the transposed derivative, cut off and taken up again."""
     path = tmp_path / "run.npz"
