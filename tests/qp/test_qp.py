@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import scipy
 from jax import enable_x64
+from padded import solution, solutions
 from problems import residuals
 
 import jaxmpc as jm
@@ -22,12 +23,10 @@ from jaxmpc.qp.solve import solve_factored
 
 INF = np.inf
 FINE = jm.ADMM(iterations=400, newton_steps=30, eps=1e-9)
-# Tests of what few steps leave share programs of one shape, `constructed(6, seed)`.
+# Tests of what few steps leave share programs of one shape, `constructed(6, seed)` and `START`.
 FEW = jm.ADMM(iterations=10, newton_steps=0)
+START = np.zeros(6), np.zeros(15)
 solve = jax.jit(jm.solve_qp)
-solve_shared = jax.jit(  # many q, l and u; one P and A
-    jax.vmap(jm.solve_qp, in_axes=(jm.QP(P=None, q=0, A=None, l=0, u=0),))
-)
 
 
 def constructed(n: int, seed: int, curvature: str = "definite"):
@@ -72,29 +71,6 @@ def as32(qp: jm.QP) -> jm.QP:
     return jax.tree.map(np.float32, qp)
 
 
-def solve_small(qp: jm.QP):
-    """`jm.solve_qp` from plain Python, of a program with up to 6 variables and 15 rows."""
-    return solve_filled(qp, 6, 15, jm.solve_qp)
-
-
-def solve_fine(qp: jm.QP):
-    """`solve` to fine tolerances, of a program with up to 8 variables and 19 rows."""
-    return solve_filled(qp, 8, 19, lambda qp: solve(qp, FINE))
-
-
-def solve_filled(qp: jm.QP, variables: int, rows: int, solve):
-    """Fill up by variables that no row holds and rows that hold nothing, so that programs of many
-    shapes are compiled once."""
-    m, n = qp.A.shape
-    P, A = np.eye(variables), np.zeros((rows, variables))
-    P[:n, :n], A[:m, :n] = qp.P, qp.A
-    free = np.full(rows - m, INF)
-    q = np.append(qp.q, np.zeros(variables - n))
-    sol = solve(jm.QP(P, q, A, np.append(qp.l, -free), np.append(qp.u, free)))
-    sol = jax.tree.map(np.asarray, sol)
-    return replace(sol, z=sol.z[:n], ray=sol.ray[:n], y=sol.y[:m], certificate=sol.certificate[:m])
-
-
 @pytest.fixture
 def x64():
     with enable_x64(True):
@@ -119,7 +95,7 @@ class TestKnownAnswers:
         """Half of the directions have no curvature: only the active rows fix them."""
         for seed in range(3):
             qp, z, _ = constructed(n, seed, "singular")
-            sol = solve(qp, replace(FINE, eps=1e-7))
+            sol = solution(qp, 1e-7) if n <= 8 else solve(qp, replace(FINE, eps=1e-7))
             assert sol.status == jm.Status.SOLVED
             np.testing.assert_allclose(sol.z, z, atol=1e-5)
 
@@ -129,7 +105,7 @@ class TestKnownAnswers:
         """P = 0: ADMM is slow there; solved and right, or said to be unfinished."""
         for seed in range(3):
             qp, z, _ = constructed(n, seed, "zero")
-            sol = solve(qp, replace(FINE, eps=1e-7))
+            sol = solution(qp, 1e-7) if n <= 8 else solve(qp, replace(FINE, eps=1e-7))
             assert sol.status in (jm.Status.SOLVED, jm.Status.ITERATION_LIMIT)
             if sol.status == jm.Status.SOLVED:
                 np.testing.assert_allclose(sol.z, z, atol=1e-5)
@@ -137,7 +113,7 @@ class TestKnownAnswers:
     @pytest.mark.slow
     def test_linear_program_in_a_box(self, x64):
         q = np.array([1.0, -2.0, 0.5])
-        sol = solve_small(box(3, P=np.zeros((3, 3)), q=q))
+        sol = solution(box(3, P=np.zeros((3, 3)), q=q))
         assert sol.status == jm.Status.SOLVED
         np.testing.assert_allclose(sol.z, -np.sign(q), atol=1e-8)
         np.testing.assert_allclose(sol.y, -q, atol=1e-8)
@@ -154,8 +130,8 @@ class TestKnownAnswers:
             np.testing.assert_allclose(sol.y, y, atol=2e-2)
 
     def test_default_settings_solve_most(self, x64):
-        status = [solve_small(constructed(6, seed)[0]).status for seed in range(20)]
-        assert np.mean(np.array(status) == jm.Status.SOLVED) >= 0.9
+        status = solutions([constructed(6, seed)[0] for seed in range(20)]).status
+        assert np.mean(status == jm.Status.SOLVED) >= 0.9
 
     @pytest.mark.slow
     @pytest.mark.parametrize("scale", [1e-6, 1e6])
@@ -190,19 +166,25 @@ class TestKnownAnswers:
         """l = u fixes every variable: never called infeasible, zero data included."""
         for value in (0.0, 1.0, -3.0):
             v = np.full(3, value)
-            sol = solve_small(box(3, l=v, u=v))
+            sol = solution(box(3, l=v, u=v))
             assert sol.status == jm.Status.SOLVED
             np.testing.assert_allclose(sol.z, v, atol=1e-8)
 
-    @pytest.mark.first(1)
-    @pytest.mark.parametrize("iterations", [None, 0])
-    def test_zero_everything(self, x64, iterations):
-        n, m = 6, 15  # as in `solve_small`
-        zeros, solver = np.zeros, jm.ADMM(iterations=iterations)
-        sol = jm.solve_qp(jm.QP(zeros((n, n)), zeros(n), zeros((m, n)), zeros(m), zeros(m)), solver)
+    @pytest.mark.parametrize(
+        "solve",
+        [
+            solution,
+            pytest.param(jm.solve_qp, marks=pytest.mark.slow),
+            pytest.param(lambda qp: jm.solve_qp(qp, jm.ADMM(0)), marks=pytest.mark.slow),
+        ],
+    )
+    def test_zero_everything(self, x64, solve):
+        n, m = 6, 15
+        zeros = np.zeros
+        sol = solve(jm.QP(zeros((n, n)), zeros(n), zeros((m, n)), zeros(m), zeros(m)))
         assert sol.status == jm.Status.SOLVED
         qp = jm.QP(np.eye(n), zeros(n), np.ones((m, n)), zeros(m), zeros(m))
-        assert jm.solve_qp(qp, solver).status != jm.Status.PRIMAL_INFEASIBLE
+        assert solve(qp).status != jm.Status.PRIMAL_INFEASIBLE
 
     def test_duplicate_and_redundant_rows(self, x64):
         qp, z, _ = constructed(2, 2)  # 7 rows, of which some hold nothing
@@ -212,7 +194,7 @@ class TestKnownAnswers:
             l=np.concatenate([qp.l, qp.l, 2 * qp.l[some]]),
             u=np.concatenate([qp.u, qp.u, 2 * qp.u[some]]),
         )  # fmt: skip
-        sol = solve_fine(twice)
+        sol = solution(twice, 1e-9)
         assert sol.status == jm.Status.SOLVED
         np.testing.assert_allclose(sol.z, z, atol=1e-7)
 
@@ -233,7 +215,7 @@ class TestKnownAnswers:
             sparse(qp.P), qp.q, sparse(qp.A), qp.l, qp.u,
             eps_abs=1e-10, eps_rel=1e-10, max_iter=100000, verbose=False,
         )  # fmt: skip
-        sol = solve(qp, FINE)
+        sol = solution(qp, 1e-9)
         assert sol.status == jm.Status.SOLVED
         np.testing.assert_allclose(sol.z, other.solve(raise_error=True).x, atol=1e-7)
 
@@ -278,7 +260,7 @@ class TestFromQpsolvers:
 
     def test_bounds_only_above(self, x64):
         qp = jm.QP.from_qpsolvers(np.eye(2), [-2, -2], ub=[1, 5])
-        np.testing.assert_allclose(solve_fine(qp).z, [1, 2], atol=1e-9)
+        np.testing.assert_allclose(solution(qp, 1e-9).z, [1, 2], atol=1e-9)
 
 
 class TestResiduals:
@@ -305,7 +287,7 @@ class TestResiduals:
 
     def test_reported_ones_are_those_of_the_answer(self, x64):
         qp, _, _ = constructed(6, 7)
-        sol = jm.solve_qp(qp, FEW)
+        sol = jm.solve_qp(qp, FEW, START)
         got = sol.primal_residual, sol.dual_residual, sol.gap
         recomputed = jax.jit(residuals)(qp, sol.z, sol.y)
         np.testing.assert_allclose(got, recomputed, rtol=1e-9, atol=1e-14)
@@ -313,7 +295,7 @@ class TestResiduals:
     def test_multiplier_sign(self, x64):
         """min ½(z − 3)² over |z| ≤ 1: y = 2 pushes down from above; mirrored below."""
         for side in (1.0, -1.0):
-            sol = solve_fine(box(1, q=np.array([-3 * side])))
+            sol = solution(box(1, q=np.array([-3 * side])), 1e-9)
             np.testing.assert_allclose([sol.z[0], sol.y[0]], [side, 2 * side], atol=1e-8)
 
 
@@ -334,7 +316,7 @@ class TestHonestStatus:
         batch = [constructed(6, seed) for seed in range(8)]
         for qp, _, _ in batch:
             settings = jm.ADMM(iterations=iterations, newton_steps=newton_steps, eps=eps)
-            sol = jm.solve_qp(qp, settings)
+            sol = jm.solve_qp(qp, settings, None if newton_steps else START)
             z, y = np.asarray(sol.z), np.asarray(sol.y)
             v, support = qp.A @ z, 0.0
             support = float(Bounds(qp.l, qp.u).support(sol.y).sum())
@@ -353,7 +335,7 @@ class TestHonestStatus:
                 assert worst > 0.01 * eps
 
     def test_few_iterations_are_a_limit(self, x64):
-        sol = jm.solve_qp(constructed(6, 0)[0], FEW)
+        sol = jm.solve_qp(constructed(6, 0)[0], FEW, START)
         assert sol.status == jm.Status.ITERATION_LIMIT
         assert sol.iterations == 10
         assert "iterations" in jm.Status(int(sol.status)).sentence
@@ -385,7 +367,7 @@ class TestHonestStatus:
         """Integer rows z₁ + z₂ ≥ 2, z₁ + z₂ ≤ 1: the certificate is (−t, t)."""
         A = np.array([[1.0, 1.0], [1.0, 1.0]])
         l, u = np.array([2.0, -INF]), np.array([INF, 1.0])
-        sol = solve_small(jm.QP(np.eye(2), np.ones(2), A, l, u))
+        sol = solution(jm.QP(np.eye(2), np.ones(2), A, l, u))
         assert sol.status == jm.Status.PRIMAL_INFEASIBLE
         y = np.asarray(sol.certificate)
         np.testing.assert_allclose(A.T @ y, 0, atol=1e-12)
@@ -395,7 +377,7 @@ class TestHonestStatus:
     def test_infeasible_zero_row(self, x64):
         """0'z ≥ 1 contradicts itself."""
         qp = jm.QP(np.eye(2), np.ones(2), np.zeros((1, 2)), np.ones(1), np.array([INF]))
-        sol = solve_small(qp)
+        sol = solution(qp)
         assert sol.status == jm.Status.PRIMAL_INFEASIBLE
         assert exact.proves_empty(qp.A, qp.l, qp.u, sol.certificate)
 
@@ -417,7 +399,7 @@ class TestHonestStatus:
             A = np.vstack([np.eye(5), a])
             l = np.append(-np.ones(5), np.abs(a).sum() + gap)
             u = np.append(np.ones(5), INF)
-            sol = solve_fine(jm.QP(np.eye(5), rng.standard_normal(5), A, l, u))
+            sol = solution(jm.QP(np.eye(5), rng.standard_normal(5), A, l, u), 1e-9)
             if gap < 0:
                 assert sol.status == jm.Status.SOLVED
             else:
@@ -430,7 +412,7 @@ class TestHonestStatus:
         """Cost falls along −z₂, which only a bound from above limits."""
         A, l, u = np.eye(2), np.array([-1, -INF]), np.array([1.0, 3.0])
         qp = jm.QP(P, np.array([0.3, 1.0]), A, l, u)
-        sol = solve_small(qp)
+        sol = solution(qp)
         assert sol.status == jm.Status.DUAL_INFEASIBLE
         d = np.asarray(sol.ray)
         np.testing.assert_allclose(np.abs(d).max(), 1)
@@ -453,6 +435,15 @@ class TestHonestStatus:
         np.testing.assert_allclose(sol.z, [0, -1e3], rtol=1e-6, atol=1e-6)
 
 
+SHARED = jm.QP(P=None, q=0, A=None, l=0, u=0)  # axes: many q, l and u; one P and A
+
+
+def each_solved(qp: jm.QP):
+    """Solutions of programs that share P and A, each with its own copy."""
+    parts = zip(qp.q, qp.l, qp.u, strict=True)
+    return solutions([jm.QP(qp.P, q, qp.A, l, u) for q, l, u in parts], dtype=qp.q.dtype)
+
+
 class TestBatches:
     def spoiled(self):
         """Five good QPs, then one for each way data can be bad."""
@@ -467,12 +458,15 @@ class TestBatches:
         return clean, jm.QP(good.P, q, good.A, l, u)
 
     @pytest.mark.parametrize("x32", [False, pytest.param(True, marks=pytest.mark.slow)])
-    def test_bad_neighbours_change_nothing(self, x32):
+    @pytest.mark.parametrize("shared", [False, pytest.param(True, marks=pytest.mark.slow)])
+    def test_bad_neighbours_change_nothing(self, x32, shared):
+        """Nor each other where P and A are those of all of them."""
+        solve = jax.jit(jax.vmap(jm.solve_qp, (SHARED,))) if shared else each_solved
         with enable_x64(not x32):
             clean, spoiled = self.spoiled()
             if x32:
                 clean, spoiled = as32(clean), as32(spoiled)
-            expected, got = solve_shared(clean), solve_shared(spoiled)
+            expected, got = solve(clean), solve(spoiled)
             bad = np.isin(np.arange(9), [1, 3, 5, 7])
             np.testing.assert_array_equal(np.asarray(got.status)[bad], jm.Status.NON_FINITE)
             assert np.isnan(got.z[bad]).all() and np.isnan(got.primal_residual[bad]).all()
@@ -480,11 +474,12 @@ class TestBatches:
                 jax.tree.map(lambda v: v[~bad], got), jax.tree.map(lambda v: v[~bad], expected)
             )
 
+    @pytest.mark.slow
     def test_batch_agrees_with_single(self, x64):
         clean, _ = self.spoiled()
-        batch = solve_shared(clean)
+        batch = jax.jit(jax.vmap(jm.solve_qp, (SHARED,)))(clean)
         for i in range(9):
-            one = solve_small(replace(clean, q=clean.q[i], l=clean.l[i], u=clean.u[i]))
+            one = jm.solve_qp(replace(clean, q=clean.q[i], l=clean.l[i], u=clean.u[i]))
             np.testing.assert_allclose(batch.z[i], one.z, atol=1e-9)
             assert batch.status[i] == one.status
 
@@ -494,7 +489,7 @@ class TestBatches:
         l, u = qp.l.copy(), qp.u.copy()
         l[0], u[0], l[1], u[1] = INF, INF, -INF, -INF
         l[2, 3], u[2, 3], l[3, 3], u[3, 3] = INF, INF, -INF, -INF
-        status = np.asarray(solve_shared(replace(qp, l=l, u=u)).status)
+        status = each_solved(replace(qp, l=l, u=u)).status
         assert (status[4:] == jm.Status.SOLVED).all()
         assert jm.Status.SOLVED not in status[:4]
 
@@ -519,9 +514,7 @@ class TestBatches:
     def test_one_factorization_for_shared_matrices(self, x64):
         clean, _ = self.spoiled()
         solver = jm.ADMM(newton_steps=0)
-        shared = jax.vmap(
-            lambda qp: jm.solve_qp(qp, solver), in_axes=(jm.QP(P=None, q=0, A=None, l=0, u=0),)
-        )
+        shared = jax.vmap(lambda qp: jm.solve_qp(qp, solver), in_axes=(SHARED,))
         shapes = self.cholesky_shapes(shared, clean)
         assert shapes and all(shape == (6, 6) for shape in shapes)
         # Convexity, whether P is singular, its range, coordinates, and one stage of rho.
@@ -648,7 +641,7 @@ class TestHardPrograms:
         """min |z|²/2, x ± s y ≤ −1: both rows push with 1/2 at (−1, 0)."""
         A = np.array([[1.0, s], [1.0, -s]])
         qp = jm.QP(np.eye(2), np.zeros(2), A, np.full(2, -np.inf), -np.ones(2))
-        found = solve_small(qp)
+        found = solution(qp)
         assert found.status == jm.Status.SOLVED
         np.testing.assert_allclose(found.z, [-1.0, 0.0], atol=1e-7)
 
@@ -656,11 +649,11 @@ class TestHardPrograms:
         """min ½p|z|² + q'z in a box: z = clip(−q/p), y = −q − pz, which is q but for its last
         digits."""
         q = np.array([-1.0, 0.5])
-        for p in 10.0 ** np.arange(-10, 3):
-            for size in 10.0 ** np.arange(-2, 7, 2):
-                found = solve_small(replace(box(2), P=p * np.eye(2), q=size * q))
-                assert found.status == jm.Status.SOLVED, (p, size)
-                np.testing.assert_allclose(found.z, np.clip(-size * q / p, -1, 1), atol=1e-9)
+        pairs = [(p, s) for p in 10.0 ** np.arange(-10, 3) for s in 10.0 ** np.arange(-2, 7, 2)]
+        found = solutions([replace(box(2), P=p * np.eye(2), q=s * q) for p, s in pairs])
+        for (p, size), status, z in zip(pairs, found.status, found.z, strict=True):
+            assert status == jm.Status.SOLVED, (p, size)
+            np.testing.assert_allclose(z, np.clip(-size * q / p, -1, 1), atol=1e-9)
 
     @pytest.mark.slow
     def test_badly_scaled_linear_programs(self, x64):
@@ -708,10 +701,11 @@ class TestSettings:
         assert warm.primal_residual + warm.dual_residual < cold.primal_residual + cold.dual_residual
 
     def test_warm_start_that_is_not_finite_counts_as_none(self, x64):
-        qp, z, y = constructed(4, 0)
-        solver = jm.ADMM(iterations=1000, newton_steps=0)
-        sol = jm.solve_qp(qp, solver, warm_start=(np.full(4, np.nan), np.full(len(y), INF)))
-        np.testing.assert_allclose(sol.z, z, atol=1e-8)
+        qp, (z, y) = constructed(6, 0)[0], START
+        none = jm.solve_qp(qp, FEW, START)
+        assert np.abs(none.z).max() > 0.1
+        for start in ((z + np.nan, y), (z, y + INF), (z + np.nan, y + INF)):
+            np.testing.assert_array_equal(jm.solve_qp(qp, FEW, start).z, none.z)
 
     def test_warm_start_of_wrong_shape(self):
         qp, z, y = constructed(4, 0)
@@ -776,6 +770,7 @@ def along(t, qp, way):
 class TestGradients:
     """Gradients of both kinds against central differences, where the active set does not change."""
 
+    @pytest.mark.slow
     def test_every_field(self, x64):
         qp, _, _ = constructed(4, 3)
         finite = lambda v: np.clip(v, -1e3, 1e3)
@@ -817,6 +812,7 @@ class TestGradients:
         numeric = [(f(qp.q + h * e) - f(qp.q - h * e)) / (2 * h) for e in np.eye(4)]
         np.testing.assert_allclose(gradient, numeric, rtol=1e-4, atol=1e-6)
 
+    @pytest.mark.slow
     def test_free_rows_give_no_nan(self, x64):
         """One NaN in the gradient of any field were one in the derivative along all of them."""
         qp, _, _ = constructed(4, 3)  # has free and zero rows
@@ -906,9 +902,11 @@ class TestOneRowDoesNotExcuseAnother:
         f32 = lambda v: np.asarray(v, np.float32)
         rows = f32([[1, 0], [1, 0], [0, 1e5]])
         qp = jm.QP(f32(np.eye(2)), f32([0, 0]), rows, f32([1, -np.inf, 1e5]), f32([np.inf, 0, 1e5]))
-        solver = jm.ADMM(iterations=100, newton_steps=0)
+        # A program of `test_status.py`, too.
+        solver = jm.ADMM(iterations=200, newton_steps=0)
         assert jm.solve_qp(qp, solver).status == jm.Status.PRIMAL_INFEASIBLE
 
+    @pytest.mark.slow
     def test_small_remainder_of_a_large_multiplier_proves_nothing(self):
         """-10 ≤ z ≤ 10 and z ≤ -1 is feasible; absorbing 1e-5 in 1000 loses it to rounding."""
         f32 = lambda v: np.asarray(v, np.float32)
@@ -922,10 +920,10 @@ class TestTolerances:
     def test_relative(self, x64):
         """One program, whose rough answer is solved to a rough tolerance."""
         qp = constructed(6, 5)[0]
-        found = jm.solve_qp(qp, replace(FEW, eps=1e-15))
+        found = jm.solve_qp(qp, replace(FEW, eps=1e-15), START)
         worst = max(float(found.primal_residual), float(found.dual_residual), float(found.gap))
         assert 1e-12 < worst and found.status == jm.Status.ITERATION_LIMIT
-        assert jm.solve_qp(qp, replace(FEW, eps=1.0)).status == jm.Status.SOLVED
+        assert jm.solve_qp(qp, replace(FEW, eps=1.0), START).status == jm.Status.SOLVED
 
     @pytest.mark.slow
     def test_newton_reaches_rounding(self, x64):

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from padded import solutions
 
 import jaxmpc as jm
 from jaxmpc.qp.residuals import Pair
@@ -108,19 +109,13 @@ def test_no_false_status_in_any_units(make, decades, x64):
 @pytest.mark.parametrize(("x64", "least"), [(True, (1e-10, 1e-13)), (False, (1e-5, 1e-6, 1e-9))])
 @pytest.mark.first(1)
 def test_a_small_coefficient_still_bounds(x64, least):
-    """min ½ z₂² − z₁ with least·z₁ ≤ 1: the optimum lies at 1/least, it is not at infinity.
-
-    Beside two variables of their own, in programs of as many rows as those of `test_statuses.py`,
-    so that one is compiled."""
-    A, free = np.zeros((6, 4)), np.full(4, INF)
-    programs = []
-    for small in least:
-        A[:2, :2] = [[small, 0], [1, 1]]
-        l, u = np.append([-INF, -1], -free), np.append([1, INF], free)
-        programs.append((np.diag([0.0, 1, 1, 1]), [-1.0, 0, 0, 0], A.copy(), l, u))
-    with jax.enable_x64(x64):
-        some = [programs[i % len(programs)] for i in range(48)]
-        status = solve(batch(some, float if x64 else np.float32)).status
+    """min ½ z₂² − z₁ with least·z₁ ≤ 1: the optimum lies at 1/least, it is not at infinity."""
+    programs = [
+        jm.QP(np.diag([0.0, 1]), np.array([-1.0, 0]), np.array([[small, 0], [1, 1]]),
+              np.array([-INF, -1]), np.array([1, INF]))
+        for small in least
+    ]  # fmt: skip
+    status = solutions(programs, dtype=float if x64 else np.float32).status
     undecided = jm.Status.ITERATION_LIMIT, jm.Status.INACCURATE
     assert np.isin(status, [jm.Status.SOLVED, *undecided]).all()
 
@@ -240,8 +235,12 @@ def test_a_pair_near_the_solution_is_not_lost():
 def test_steps_of_admm_that_move_nothing_are_inaccurate():
     """In float32 the rounding of a multiplier of 2^16 is 2^-8: more steps, as ITERATION_LIMIT
     advises, would be in vain."""
-    one = np.ones(1, np.float32)
-    qp = jm.QP(one[None], -1e5 * one / 3, one[None], -one, one / 3)
+    f32 = lambda *v: np.array(v, np.float32)
+    none = f32(np.inf, np.inf)
+    qp = jm.QP(
+        np.eye(2, dtype=np.float32), f32(-1e5 / 3, 0), np.eye(3, 2, dtype=np.float32),
+        f32(-1, *-none), f32(1 / 3, *none),
+    )  # fmt: skip
     solver = jm.ADMM(iterations=200, newton_steps=0, eps=0.0)
     assert jm.Status(int(jm.solve_qp(qp, solver).status)).name == "INACCURATE"
 
@@ -249,9 +248,8 @@ def test_steps_of_admm_that_move_nothing_are_inaccurate():
 def test_solutions_say_what_their_status_means():
     q = np.ones((48, 4))
     q[7] = np.nan
-    with jax.enable_x64(True):  # the program of `test_a_small_coefficient_still_bounds`
-        qp = batch([(np.eye(4), v, np.eye(6, 4), -np.ones(6), np.ones(6)) for v in q], float)
-        many = solve(qp)
+    qps = [jm.QP(np.eye(4), v, np.eye(6, 4), -np.ones(6), np.ones(6)) for v in q]
+    many = solutions(qps)
     np.testing.assert_array_equal(many.solved, np.arange(48) != 7)
     assert "status=47 SOLVED + 1 NON_FINITE" in repr(many) and len(repr(many)) < 500
     with pytest.raises(ValueError, match="sentence: of 47 SOLVED"):
@@ -261,5 +259,5 @@ def test_solutions_say_what_their_status_means():
     assert one.solved and one.sentence == jm.Status.SOLVED.sentence
     assert "status=SOLVED" in repr(one)
     with pytest.raises(ValueError, match="sentence: of traced int32"):
-        jax.jit(lambda: jm.solve_qp(jax.tree.map(lambda v: v[0], qp)).sentence)()
+        jax.jit(lambda: jm.solve_qp(qps[0]).sentence)()
     assert jax.jit(lambda sol: sol.solved)(one)

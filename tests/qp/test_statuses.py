@@ -2,10 +2,10 @@
 optimal value of each against Clarabel."""
 
 import clarabel
-import jax
 import numpy as np
 import pytest
 import scipy.sparse
+from padded import solutions
 
 import jaxmpc as jm
 from jaxmpc import Status
@@ -54,23 +54,12 @@ def by_clarabel(P, q, A, l, u):
     return str(found.status), found.obj_val
 
 
-solve = jax.jit(jax.vmap(jm.solve_qp))
-
-
-def solved(programs):
-    """Return the solutions of programs of like shapes, in NumPy; 48 at a time."""
-    parts = [np.stack(part) for part in zip(*programs, strict=True)]
-    with jax.enable_x64(True):
-        some = [solve(jm.QP(*(v[i : i + 48] for v in parts))) for i in range(0, len(programs), 48)]
-    return jax.tree.map(lambda *v: np.concatenate(v), *some)
-
-
 @pytest.mark.parametrize("scaled", [False, True])
 @pytest.mark.parametrize(("n", "m"), [(4, 6), pytest.param(8, 5, marks=pytest.mark.slow)])
 def test_random_programs(n, m, scaled):
     rng = np.random.default_rng(5)
     programs = [draw(rng, n, m, scaled) for _ in range(96)]
-    found = solved(programs)
+    found = solutions([jm.QP(*program) for program in programs])
     counts = dict.fromkeys(EXPECTED, 0)
     for program, status, cost in zip(programs, found.status, found.cost, strict=True):
         kind, value = by_clarabel(*program)
@@ -92,8 +81,8 @@ def test_programs_with_their_solution_at_zero(upper, cost):
         A = np.vstack([np.eye(n), rng.normal(size=(2, n))]) * 10.0 ** rng.uniform(-2, 2, (m, 1))
         y = np.where(np.arange(m) < n, -rng.uniform(0.1, 1, m), 0.0)
         P, ends = cost * (M @ M.T + 0.1 * np.eye(n)), (np.zeros(m), np.full(m, upper))
-        return P, -cost * A.T @ y, A, *ends
+        return jm.QP(P, -cost * A.T @ y, A, *ends)
 
-    found = solved([program() for _ in range(96)])
+    found = solutions([program() for _ in range(96)])
     assert (found.status == Status.SOLVED).all()
     assert np.abs(found.z).max() < 1e-9
