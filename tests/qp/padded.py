@@ -10,13 +10,15 @@ import numpy as np
 
 import jaxmpc as jm
 
-VARIABLES, ROWS, COUNT = 8, 19, 48
+VARIABLES, ROWS, COUNT = 8, 19, 32
 INF = np.inf
 
 
 @jax.jit
 @partial(jax.vmap, in_axes=(0, None))
 def solve(qp, eps):
+    """Solutions of a batch; `COUNT` programs of (5, 12) with soft rows are a shape, too, of
+    `test_qp_units.py` and `test_projection.py`."""
     return jm.solve_qp(qp, jm.ADMM(eps=eps))
 
 

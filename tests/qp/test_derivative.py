@@ -160,7 +160,7 @@ def assert_near(got: Any, expected: Any, rtol: float) -> None:
 class TestEveryField:
     """z, y and cost against central differences; jvp and vjp are each other's adjoint."""
 
-    @pytest.mark.slow
+    @pytest.mark.first(1)
     @pytest.mark.parametrize("first", range(0, 288, 8))
     def test_central_differences(self, x64, first):
         h, cases = 4e-4, [(first + seed, name) for seed in range(8) for name in DIRECTIONS]
@@ -195,9 +195,9 @@ class TestEveryField:
         np.testing.assert_allclose(gradient.P, np.swapaxes(gradient.P, 1, 2), atol=1e-12)
 
 
+@pytest.mark.slow
 class TestClosedForms:
     @pytest.mark.parametrize("solver", [PLAIN, UNROLLED], ids=["implicit", "unrolled"])
-    @pytest.mark.first(1)
     def test_equalities(self, x64, solver):
         """K (z, y) = (−q, b), K the KKT matrix: d(z, y) = K⁻¹(−dq − dP z − dA'y, db − dA z)."""
         rng = np.random.default_rng(3)
@@ -224,7 +224,7 @@ class TestClosedForms:
         push, turn = np.einsum("aj,i->aij", inverse[:, :n], y), inverse[:, n:, None] * z
         near(of_A, -push - turn)
 
-    @pytest.mark.parametrize("mode", ["implicit", pytest.param("unrolled", marks=pytest.mark.slow)])
+    @pytest.mark.parametrize("mode", ["implicit", "unrolled"])
     def test_box(self, x64, mode):
         """P = I, A = I: z = clip(−q, l, u), so dz/dq, dz/dl, dz/du are masks, and exactly so."""
         q, one = jnp.array([0.3, -0.8, 2.0, -1.5, 5.0]), jnp.ones(5)
@@ -240,7 +240,6 @@ class TestClosedForms:
             np.testing.assert_allclose(got, np.diag(np.asarray(mask, float)), atol=1e-14)
 
     @pytest.mark.parametrize("size", [1, 3])
-    @pytest.mark.first(1)
     def test_ball(self, x64, size):
         """z = centre + r d/|d|, d = −q − centre: dz/dq = −r/|d| (I − nn'), dz/dr = n, y = d − rn.
 
@@ -674,6 +673,12 @@ class TestInfeasible:
         assert not bad, bad
 
 
+def level_of(p: np.ndarray, S: np.ndarray) -> float:
+    """λ with |S z(λ)| = 1, z(λ) = (I + λS²)⁻¹ p: S diagonal, |Sp| > 1."""
+    size = lambda level: np.linalg.norm(S @ (p / (1 + level * np.diag(S) ** 2))) - 1
+    return scipy.optimize.brentq(size, 0.0, 1e3, xtol=1e-15)
+
+
 class TestKinks:
     """min ½z² + qz, z ≤ u, is z = min(−q, u): one-sided derivatives at q = −u are −1 and 0 with
     respect to q, 0 and 1 with respect to u."""
@@ -685,8 +690,9 @@ class TestKinks:
         qps = [embedded([[1]], [qi], [[ai]], [-INF], [ui]) for qi, ui, ai in parts]
         names = (unit("q", 0), unit("u", 0), unit("A", 0, 0))
         ds = [d for d in names for _ in qps]
-        _, status, (dz, dy, _), _ = evaluate(qps * 3, ds, smoothing=mu)
+        _, status, (dz, dy, _), gradient = evaluate(qps * 3, ds, smoothing=mu)
         np.testing.assert_array_equal(status, jm.Status.SOLVED)
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
         return np.stack([dz[:, 0], dy[:, 0]], axis=1).reshape(3, -1, 2)
 
     def test_weakly_active_counts_as_inactive(self, x64):
@@ -767,36 +773,40 @@ class TestKinks:
         """Rows a, b at an angle of 0.01 that hold z at a vertex, dz/du = (a, b)⁻ᵀ; and the distance
         from p to an ellipse |Sz| ≤ 1 with half axes 1 and 1/300, z = M⁻¹p with M = I + λS²,
         dz/dp = M⁻¹ − nn'/n'Mn with n = M⁻¹S²z. In float32 alone both were wrong by a half."""
-        angle = np.float32(0.01)
+        angle, one, eye = np.float32(0.01), np.ones(2, np.float32), np.eye(2, dtype=np.float32)
         rows = np.array([[1.0, 0.0], [np.cos(angle), np.sin(angle)]], np.float32)
-        one, eye = np.ones(2, np.float32), np.eye(2, dtype=np.float32)
-
-        @jax.jit
-        @jax.jacfwd
-        def vertex(u):
-            beyond = jnp.asarray(rows.T @ one)
-            return outputs(jm.QP(eye, -beyond, rows, -INF * one, u), jm.ADMM())[0][0]
-
-        z = np.linalg.solve(rows.astype(float), one)
-        moved = vertex(np.float32(rows @ z * 0.5))
-        inverse = np.linalg.inv(rows.astype(float))
-        np.testing.assert_allclose(moved, inverse, atol=1e-3 * np.abs(inverse).max())
-
-        S = np.diag([1.0, 300.0])
+        S = np.diag([1.0, 300.0]).astype(np.float32)
 
         @jax.jit
         @jax.vmap
-        @jax.jacfwd
-        def ellipse(p):
-            ball = {"radius": one[:1], "balls": (2,)}
-            qp = jm.QP(eye, -p, S.astype(np.float32), 0 * one, 0 * one, **ball)
-            return outputs(qp, jm.ADMM())[0][0]
+        def jacobian(p, u, radius, z, y):
+            """Of the point next to p with both rows ≤ u in the ellipse of this radius."""
+            A, centre = np.vstack([rows, S]), 0 * one
 
-        for p, found in zip(points := np.array([[1.5, 0.3], [0.5, 0.1], [-2, 1]]),
-                            ellipse(np.float32(points)), strict=True):  # fmt: skip
-            z = lambda level, p=p: p / (1 + level * np.diag(S) ** 2)
-            size = lambda level, z=z: np.linalg.norm(S @ z(level)) - 1
-            M = np.eye(2) + scipy.optimize.brentq(size, 0.0, 1e3, xtol=1e-15) * S**2
+            def program(p, u):
+                l, u = jnp.concatenate([-INF * one, centre]), jnp.concatenate([u, centre])
+                return jm.QP(eye, -p, A, l, u, radius=radius[None], balls=(2,))
+
+            made = factorise(eye, jnp.asarray(A), jm.ADMM(), (2,))
+            conditions, undo = dense_conditions(program(p, u), (made, 0.0), z, y)
+            along = lambda *d: undo(jax.jvp(lambda *v: conditions(program(*v)), (p, u), d)[1])[0]
+            turned = lambda *d: jax.vmap(along, out_axes=1)(*d)
+            return turned(eye, 0 * eye), turned(0 * eye, eye)
+
+        # The vertex: z − p + rows'y = 0. The ellipse: z(λ) − p + S'y = 0 with y = λ S z.
+        vertex = np.linalg.solve(rows.astype(float), 0.5 * one)
+        push = one - np.linalg.solve(rows.T.astype(float), vertex)
+        points, none = np.array([[1.5, 0.3], [0.5, 0.1], [-2, 1]]), np.zeros(2)
+        weights = [1 + level_of(p, S) * np.diag(S) ** 2 for p in points]
+        ends = [(p / w, np.append(none, np.linalg.solve(S, p - p / w)))
+                for p, w in zip(points, weights, strict=True)]  # fmt: skip
+        z, y = map(np.stack, zip((vertex, np.append(push, none)), *ends, strict=True))
+        p, u = np.vstack([rows.T @ one, points]), np.vstack([0.5 * one, np.full((3, 2), INF)])
+        of_p, of_u = jacobian(*map(np.float32, (p, u, [INF, 1, 1, 1], z, y)))
+        inverse = np.linalg.inv(rows.astype(float))
+        np.testing.assert_allclose(of_u[0], inverse, atol=1e-3 * np.abs(inverse).max())
+        for p, found in zip(points, of_p[1:], strict=True):
+            M = np.eye(2) + level_of(p, S) * S.astype(float) ** 2
             n = np.linalg.solve(M, S**2 @ np.linalg.solve(M, p))
             expected = np.linalg.inv(M) - np.outer(n, n) / (n @ M @ n)
             np.testing.assert_allclose(found, expected, atol=1e-5)

@@ -13,8 +13,10 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 import numpy as np
+import padded
 import pytest
 from jax import enable_x64
+from padded import COUNT
 from scipy.optimize import brentq, minimize_scalar
 
 import jaxmpc as jm
@@ -23,11 +25,9 @@ from jaxmpc.qp.problem import Bounds
 INF = np.inf
 N, ROWS = 5, 12  # variables and rows of every program below
 BALLS = (3, 2)
-COUNT = 32  # programs in a batch
 
-FINE = jm.ADMM(iterations=400, newton_steps=60)
 COARSE = jm.ADMM(iterations=3, newton_steps=0)
-solve_fine = jax.jit(jax.vmap(lambda qp, eps: jm.solve_qp(qp, replace(FINE, eps=eps)), (0, None)))
+solve_fine = lambda qp, eps: padded.solve(qp, np.asarray(eps, qp.q.dtype))  # of `COUNT`
 solve_coarse = jax.jit(
     jax.vmap(lambda qp, eps: jm.solve_qp(qp, replace(COARSE, eps=eps)), (0, None))
 )
@@ -474,7 +474,8 @@ class TestBounds:
         exact = rho * np.sum(self.each("prox_residual", b, v, rho) * direction, axis=1)
         np.testing.assert_allclose(exact, numeric, rtol=1e-6, atol=1e-4 * rho.max())
 
-    @pytest.mark.parametrize("wide", [True, False])
+    @pytest.mark.first(1)
+    @pytest.mark.parametrize("wide", [False, True])
     def test_extremes_give_numbers(self, wide):
         """All penalties from 0 and 1e-6 to 1e6 and inf with all kinds of intervals, balls of
         radius 0 and 1e6, at v on a kink, at the centre and far away: nothing but finite numbers,
@@ -873,7 +874,7 @@ class TestOwnMatrices:
             solved = batch.status == jm.Status.SOLVED
             assert solved.mean() > 0.99  # the rest: see `test_small_penalties_are_solved`
             np.testing.assert_allclose(batch.z[solved], z[solved], atol=2e-2 if x32 else 1e-7)
-            single = jax.jit(lambda qp, eps: jm.solve_qp(qp, replace(FINE, eps=eps)))
+            single = jax.jit(lambda qp, eps: jm.solve_qp(qp, jm.ADMM(eps=eps)))
             for i in range(0, count, max(count // 256, 1)):
                 alone = single(one(qp, i), eps)
                 np.testing.assert_allclose(batch.z[i], alone.z, atol=1e-2 if x32 else 1e-7)
@@ -1014,6 +1015,7 @@ class TestBadInput:
 
         self.spoilt(make, [(3, "soft_linear", 8, 1.0)])
 
+    @pytest.mark.slow
     def test_integers_and_lists(self, x64):
         """min ½|z|² − 3Σz with |z₁| ≤ 1 at cost d + ½d², |z₂| ≤ 1 at cost 2d, |(z₃, z₄)| ≤ 1.
 

@@ -903,7 +903,7 @@ class TestOneRowDoesNotExcuseAnother:
         rows = f32([[1, 0], [1, 0], [0, 1e5]])
         qp = jm.QP(f32(np.eye(2)), f32([0, 0]), rows, f32([1, -np.inf, 1e5]), f32([np.inf, 0, 1e5]))
         # A program of `test_status.py`, too.
-        solver = jm.ADMM(iterations=200, newton_steps=0)
+        solver = jm.ADMM(iterations=100, newton_steps=0)
         assert jm.solve_qp(qp, solver).status == jm.Status.PRIMAL_INFEASIBLE
 
     @pytest.mark.slow

@@ -241,7 +241,7 @@ def test_steps_of_admm_that_move_nothing_are_inaccurate():
         np.eye(2, dtype=np.float32), f32(-1e5 / 3, 0), np.eye(3, 2, dtype=np.float32),
         f32(-1, *-none), f32(1 / 3, *none),
     )  # fmt: skip
-    solver = jm.ADMM(iterations=200, newton_steps=0, eps=0.0)
+    solver = jm.ADMM(iterations=100, newton_steps=0, eps=0.0)
     assert jm.Status(int(jm.solve_qp(qp, solver).status)).name == "INACCURATE"
 
 
