@@ -44,11 +44,14 @@ def least_squares(mpc, moves):
     return np.linalg.lstsq(J, -base, rcond=None)[0][moves][:, None], base, J
 
 
+RATED = {"input_rate_weight": [[0.7]], "prestabilise": [[-0.6, -0.9]]}
+
+
 @pytest.mark.first(1)
 @pytest.mark.parametrize(
     "fields",
     [
-        {"input_rate_weight": [[0.7]], "prestabilise": [[-0.6, -0.9]]},
+        RATED,
         {"input_rate_weight": [[0.7]], "control_horizon": (1, 2, 3)},
         {"stage_weights": np.array([1.0, 1.0, 2.0, 1.0, 1.0, 1.0])},
     ],
@@ -94,5 +97,6 @@ def test_limits_are_kept_under_the_forecast():
 def test_bad_forecasts():
     with pytest.raises(ValueError, match=r"forecast: shape \(5, 2\). Give \(2,\) or \(6, 2\)"):
         jm.solve(PLAIN, X0, forecast=np.zeros((5, 2)))
-    plan = jm.solve(PLAIN, X0, forecast=[np.nan, 0.0])
+    mpc, bad = replace(PLAIN, **RATED), FORECAST + [np.nan, 0.0]  # the program of the plan above
+    plan = jm.solve(mpc, X0, R_X, input_reference=R_U, forecast=bad, previous_input=U0)
     assert plan.status == jm.Status.NON_FINITE

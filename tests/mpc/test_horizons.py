@@ -90,18 +90,18 @@ ONE_STEP = {
 }
 
 
-@pytest.mark.parametrize(
-    "name", ["terminal set", *(pytest.param(name, marks=pytest.mark.slow) for name in ONE_STEP)]
-)
-def test_horizons_of_one_step(name):
+@pytest.mark.first(1)
+@pytest.mark.parametrize("name", ONE_STEP)
+@pytest.mark.parametrize("solve", [solve_stagewise, jm.solve])
+def test_horizons_of_one_step(name, solve):
     """Inputs that nothing but their own weight moves are zero, and a block of rows may be empty."""
     system = jm.LinearSystem([[1.0, 0.1], [0.0, 1.0]], [[0.005], [0.1]], dt=0.1)
     limits = {"states": jm.Box([-1.0, -1.0], [1.0, 1.0]), "inputs": jm.Box(-1, 1)}
     given = {**limits, "constrain_initial": False, **ONE_STEP[name]}
     mpc = jm.MPC(system, np.eye(2), 1.0, 1, **given)
-    for solve in (jm.solve, jm.mpc.solve_stagewise):
-        plan = solve(mpc, np.array([0.3, 0.2]))
-        assert plan.status == jm.Status.SOLVED and abs(plan.inputs).max() < 1e-9
+    plan = solve(mpc, np.array([0.3, 0.2]))
+    assert plan.status == jm.Status.SOLVED and abs(plan.inputs).max() < 1e-9
+    jax.eval_shape(lambda x: jm.solve(mpc, x), np.array([0.3, 0.2]))
 
 
 def test_policies_without_limits_on_states_have_no_map():

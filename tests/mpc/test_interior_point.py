@@ -25,48 +25,60 @@ def least_cost(mpc, x0):
     return problem.solve(solver="CLARABEL", tol_gap_rel=1e-10, tol_feas=1e-10)
 
 
+@jax.jit
+@jax.vmap
+def solve(mpc, x0):
+    return jm.mpc.solve_stagewise(mpc, x0, solver=jm.ADMM(iterations=0))
+
+
+COUNT, N, n, m = 64, 20, 4, 2  # of both tests, which share a program
+
+
+def stacked(problems):
+    return jax.tree.map(lambda *v: np.stack(v), *(jax.tree.map(np.asarray, p) for p in problems))
+
+
 def test_plans_from_far_outside_soft_limits_are_solved():
     """States up to 2.5 times beyond soft limits of a small weight, of which most plans once ended
     at the limit of steps; their costs are least."""
-    rng, k, count = np.random.default_rng(0), 2, 8
+    rng, k, count = np.random.default_rng(0), m, 8
     W, G = rng.normal(size=(2, k, k))
     inverse = np.linalg.inv(np.eye(k) + W @ W.T / k)
     A = np.block([[np.zeros((k, k)), np.eye(k)], [-inverse @ (G + G.T) / 2, -0.5 * inverse]])
     system = jm.LinearSystem.from_continuous(A, np.vstack([np.zeros((k, k)), inverse]), 0.05)
     limit = np.repeat([1.0, 0.8], k)
     mpc = jm.MPC(
-        system, np.repeat([10.0, 1.0], k), 0.1 * np.ones(k), 20, states=jm.Box(-limit, limit),
+        system, np.repeat([10.0, 1.0], k), 0.1 * np.ones(k), N, states=jm.Box(-limit, limit),
         inputs=jm.Box(-3 * np.ones(k), 3 * np.ones(k)), prestabilise=False,
     )  # fmt: skip
     soft = jm.soften(mpc, 10.0)
     x0s = rng.uniform(-2.5, 2.5, (count, 2 * k)) * limit
     with jax.enable_x64(True):
-        solver = jm.ADMM(iterations=0)
-        plan = jax.jit(jax.vmap(lambda x: jm.mpc.solve_stagewise(soft, x, solver=solver)))(x0s)
+        plan = solve(stacked([soft] * COUNT), np.resize(x0s, (COUNT, n)))
     assert np.all(plan.status == jm.Status.SOLVED)
-    for x0, cost in zip(x0s, plan.cost, strict=True):
+    for x0, cost in zip(x0s, plan.cost[:count], strict=True):
         np.testing.assert_allclose(cost, least_cost(soft, x0), rtol=1e-6)
 
 
 def test_soft_rows_without_a_penalty_are_no_rows():
     """A multiplier z with 0 < z < ρ does not exist for ρ = 0: the interior point method had no
     interior. Beside the same problem without such rows."""
-    rng, N, count = np.random.default_rng(0), 4, 64
-    solve = lambda mpc, x: jm.mpc.solve_stagewise(mpc, x, solver=jm.ADMM(iterations=0))
-    solve = jax.jit(jax.vmap(solve))
+    rng = np.random.default_rng(0)
     problems = []
-    for _ in range(count):
-        system = jm.LinearSystem(0.5 * rng.normal(size=(3, 3)), rng.normal(size=(3, 2)), dt=1.0)
-        rho = rng.choice([0.0, 0.5, 2.0], 4)
-        soft = jm.Soft(rng.normal(size=(4, 3)), -0.2 * np.ones(4), 0.1 * np.ones(4), rho=rho)
-        inputs = jm.Box(-0.2 * np.ones(2), 0.3 * np.ones(2))
-        mpc = jm.MPC(system, np.eye(3), 0.1 * np.eye(2), N, inputs=inputs, soft=soft)
+    for _ in range(COUNT):
+        system = jm.LinearSystem(0.4 * rng.normal(size=(n, n)), rng.normal(size=(n, m)), dt=1.0)
+        rho = rng.choice([0.0, 0.5, 2.0], n)
+        box = jm.Box(-np.ones(n), np.ones(n))
+        inputs = jm.Box(-0.2 * np.ones(m), 0.3 * np.ones(m))
+        mpc = jm.soften(jm.MPC(system, np.eye(n), 0.1 * np.eye(m), N, states=box, inputs=inputs,
+                               prestabilise=False), 1.0)  # fmt: skip
+        limits = {"lower": -0.2 * np.ones(n), "upper": 0.1 * np.ones(n), "rho": rho}
+        soft = replace(mpc.soft[0], C=rng.normal(size=(n, n)), **limits)
         free = np.where(rho > 0, 0.1, np.inf)
-        without = replace(mpc, soft=(replace(soft, lower=np.minimum(-0.2, -free), upper=free),))
-        problems.append((mpc, without))
-    stacked = jax.tree.map(lambda *v: np.stack(v), *(jax.tree.map(np.asarray, p) for p in problems))
-    x0s = rng.normal(size=(count, 3))
+        none = replace(soft, lower=np.minimum(-0.2, -free), upper=free)
+        problems.append([replace(mpc, soft=(rows,)) for rows in (soft, none)])
+    x0s = rng.normal(size=(COUNT, n))
     with jax.enable_x64(True):
-        plans, others = (solve(mpcs, x0s) for mpcs in stacked)
+        plans, others = (solve(stacked(mpcs), x0s) for mpcs in zip(*problems, strict=True))
     assert np.all(plans.status == jm.Status.SOLVED) and np.all(others.status == jm.Status.SOLVED)
     np.testing.assert_allclose(plans.cost, others.cost, rtol=1e-7)

@@ -211,7 +211,7 @@ class TestAnotherSolver:
 
 
 class TestRiccati:
-    @pytest.mark.parametrize("horizon", [1, 2, 5, 20])
+    @pytest.mark.parametrize("horizon", [7, 1, 2, 5, 20])
     @pytest.mark.first(1)
     def test_unconstrained_is_lqr_at_every_horizon(self, horizon):
         mpc = free(horizon)
@@ -294,7 +294,7 @@ class TestPrestabilising:
 
 class TestReferences:
     @pytest.mark.parametrize("moving", [True, False], ids=["moving", "constant"])
-    @pytest.mark.parametrize("name", ["hidden product", "drifting", "unstable"])
+    @pytest.mark.parametrize("name", ["drifting", "hidden product", "unstable"])
     @pytest.mark.first(1)
     def test_tracking(self, name, moving):
         """Cost Σ (x − r)'Q(x − r) + u'Ru + …, with the states kept, by another solver."""
@@ -640,6 +640,7 @@ def test_a_float64_controller_outside_64_bit_mode_is_refused():
 
 
 @pytest.mark.cpu
+@pytest.mark.first(2)
 @pytest.mark.parametrize("call", [jm.solve, jm.solve_many, jm.Controller])
 def test_dense_problems_that_take_long_or_do_not_fit_are_told_before_any_compile(monkeypatch, call):
     """1,200 steps of two states and an input, with limits of all: 1,200 variables, 3,600 rows."""

@@ -202,7 +202,7 @@ def texts(monkeypatch, x64):
         # Of a search y and v: the count of its steps may differ by rounding.
         count = 2 if program.name == "dual_steps" else len(found)
         for ours, others in zip(found[:count], by_text, strict=False):
-            rounding = 1e3 * np.finfo(ours.dtype).eps * max(1.0, float(jnp.max(jnp.abs(ours))))
+            rounding = 1e3 * np.finfo(ours.dtype).eps * max(1.0, np.abs(np.asarray(ours)).max())
             np.testing.assert_allclose(others, ours, atol=rounding)
         names.append(program.name)
         return found
@@ -230,7 +230,8 @@ def call_search(**case):
         dual = Dual(made.A, made.S, bounds, limit)
         return dual_search_kernel(dual, cold, cold, jnp.int32(0), true, steps)
 
-    cold = jax.vmap(lambda q, b: DualPoint.of(made.A, q, b, jnp.zeros_like(b.l)))(q, bounds)
+    points = jax.jit(jax.vmap(lambda q, b: DualPoint.of(made.A, q, b, jnp.zeros_like(b.l))))
+    cold = points(q, bounds)
     jax.vmap(search)(bounds, cold)
 
 
@@ -268,18 +269,19 @@ def call_recursions(dtype):
     N, n, m, random = 3, 5, 2, random_of(dtype)
 
     def weights(*shape):
-        W = random(*shape)
-        return W @ W.swapaxes(-1, -2) + jnp.eye(shape[-1], dtype=dtype)
+        W = np.asarray(random(*shape))
+        return jnp.asarray(W @ W.swapaxes(-1, -2) + np.eye(shape[-1], dtype=dtype))
 
     A, B, Q, R = random(N, n, n), random(N, n, m), weights(N + 1, n, n), weights(N, m, m)
     gains = jax.vmap(recursion_kernels._riccati_kernel)(Q, R, A, B)
     gx, gu = random(N + 1, n), random(N, m)
     jax.vmap(recursion_kernels._tracking_kernel)(gains, A, B, gx, gu)
     jax.vmap(recursion_kernels._riccati_in_pieces)(Q, R, A, B)
-    jax.vmap(recursion_kernels._recurrence_in_pieces)(A, A @ A, 0 * A[:, 0])
+    w, start, given = map(np.asarray, (gx[:, 1:], gx[:, 0], A))
+    jax.vmap(recursion_kernels._recurrence_in_pieces)(A, given @ given, 0 * given[:, 0])
     for adjoint in (False, True):
         again = functools.partial(recursion_kernels._recurrence_kernel, adjoint=adjoint)
-        jax.vmap(again, in_axes=(None, 0, 0))(A[0], gx[:, 1:], gx[:, 0])
+        jax.vmap(again, in_axes=(None, 0, 0))(given[0], w, start)
 
 
 RECURSIONS = {
@@ -297,14 +299,18 @@ RECURSIONS = {
     [
         (lambda: call_admm(n=7, m=11, B=5), {"admm_steps"}),
         (lambda: call_admm(n=10, m=30, B=4, soft=True, balls=(2, 3)), {"admm_steps"}),
-        (lambda: call_admm(n=8, m=40, B=18, stages=2, dtype=jnp.float64), {"admm_steps"}),
+        pytest.param(
+            lambda: call_admm(n=8, m=40, B=18, stages=2, dtype=jnp.float64),
+            {"admm_steps"},
+            marks=pytest.mark.slow,
+        ),
         (lambda: call_search(n=7, m=11, B=4), {"dual_steps"}),
         pytest.param(
             lambda: call_search(n=20, m=30, B=2, soft=True), {"dual_steps"}, marks=pytest.mark.slow
         ),
         (call_damped, {"damped_steps"}),
         (call_in_registers, {"in_registers"}),
-        (lambda: call_line_search(False), {"in_registers"}),
+        pytest.param(lambda: call_line_search(False), {"in_registers"}, marks=pytest.mark.slow),
         (lambda: call_line_search(True), {"in_registers"}),
         (lambda: call_recursions(jnp.float64), RECURSIONS),
         pytest.param(lambda: call_recursions(jnp.float32), RECURSIONS, marks=pytest.mark.slow),
@@ -515,11 +521,12 @@ def test_no_kernels_where_programs_run_on_a_cpu_beside_a_gpu(tmp_path, monkeypat
     for device, there in ((None, True), (jax.devices("cpu")[0], False), ("cpu", False)):
         with jax.default_device(device):
             assert jax_transformations.on_gpu() == there
-    traced = jax.make_jaxpr(jax.vmap(jm.Controller(joint(), SOLVER).plan))(STATES)
+    few = jm.ADMM(iterations=7, newton_steps=0)
+    traced = jax.make_jaxpr(jax.vmap(jm.Controller(joint(), few).plan))(np.float32(STATES))
     assert "gpu_kernel" in str(traced)
     pytest.importorskip("flatbuffers")
     monkeypatch.setattr(kernel.kernel_p, "bind", None)
-    export_jax(joint(), tmp_path / "plan", SOLVER, dtype="float32")
+    export_jax(joint(), tmp_path / "plan", few, dtype="float32")
 
 
 @pytest.mark.parametrize(

@@ -691,8 +691,9 @@ class TestSoftRows:
         np.testing.assert_allclose(warm.z, z, atol=1e-6)
 
 
+# In the fast suite balls are met in the programs of `test_derivative.py`.
+@pytest.mark.slow
 class TestBalls:
-    @pytest.mark.slow
     def test_known_answers(self, x64):
         """No ball, one or both active: z and the multipliers, along the normals, as constructed."""
         qp, z, y = ball_batch()
