@@ -191,11 +191,10 @@ def test_some_hundred_steps_solve_plans_under_policies(policy, tmp_path):
 
 @compiled
 def test_float(tmp_path):
-    mpc, solver = problems.joint_o_inf(6), jm.ADMM(iterations=100, newton_steps=0)
+    mpc, solver = problems.joint_o_inf(6), jm.ADMM(iterations=300, newton_steps=0)
     code = Compiled(mpc, solver, tmp_path, dtype="float32")
-    with jax.enable_x64(True):
-        u, *_ = jm.Controller(mpc, solver)(np.array([0.2, -0.1]))
-    np.testing.assert_allclose(code.step([0.2, -0.1])[0], u, atol=1e-3)
+    best = problems.least_distance(mpc, np.array([0.2, -0.1]))  # by non-negative least squares
+    np.testing.assert_allclose(code.step([0.2, -0.1])[0], best[0], atol=1e-3)
 
 
 def test_bad_arguments(tmp_path):

@@ -33,8 +33,11 @@ def tightened(horizon):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("make", [every_row, tightened])
-@pytest.mark.parametrize("x64", [True, False])
+@pytest.mark.first(2)
+@pytest.mark.parametrize(
+    ("make", "x64"),
+    [(every_row, True), (tightened, False), (every_row, False), (tightened, True)],
+)
 def test_it_is_that_of_the_traced_program(make, x64, compiled):
     with jax.enable_x64(x64):
         compiled.clear()

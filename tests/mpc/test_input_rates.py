@@ -65,6 +65,7 @@ def by_clarabel(mpc, x0, previous, states, inputs):
     return found.value, u.value
 
 
+@pytest.mark.slow  # rates beside everything else, stage by stage: `test_varying.py`
 @pytest.mark.parametrize("seed", range(4))
 def test_plans_are_those_of_other_solvers(seed):
     mpc, x0, previous, states, inputs = problem(seed)

@@ -66,7 +66,7 @@ def test_soft_rows_without_a_penalty_are_no_rows():
     rng = np.random.default_rng(0)
     problems = []
     for _ in range(COUNT):
-        system = jm.LinearSystem(0.4 * rng.normal(size=(n, n)), rng.normal(size=(n, m)), dt=1.0)
+        system = jm.LinearSystem(0.4 * rng.normal(size=(n, n)), rng.normal(size=(n, m)), dt=0.05)
         rho = rng.choice([0.0, 0.5, 2.0], n)
         box = jm.Box(-np.ones(n), np.ones(n))
         inputs = jm.Box(-0.2 * np.ones(m), 0.3 * np.ones(m))
@@ -82,3 +82,21 @@ def test_soft_rows_without_a_penalty_are_no_rows():
         plans, others = (solve(stacked(mpcs), x0s) for mpcs in zip(*problems, strict=True))
     assert np.all(plans.status == jm.Status.SOLVED) and np.all(others.status == jm.Status.SOLVED)
     np.testing.assert_allclose(plans.cost, others.cost, rtol=1e-7)
+
+
+def test_plans_that_dose_nothing():
+    """u ≥ 0 alone: with A, B, x0 ≥ 0 all states, and all costs, grow with every input."""
+    rng, problems = np.random.default_rng(0), []
+    for _ in range(COUNT):
+        A = rng.uniform(0, 1, (n, n))
+        A *= rng.uniform(0.5, 0.95) / np.abs(np.linalg.eigvals(A)).max()
+        system = jm.LinearSystem(A, rng.uniform(0, 1, (n, m)), dt=0.05)
+        free = jm.Box(np.full(n, -np.inf), np.full(n, np.inf))
+        doses = jm.Box(np.zeros(m), np.full(m, np.inf))
+        mpc = jm.MPC(system, np.eye(n), 0.1 * np.eye(m), N, states=free, inputs=doses,
+                     prestabilise=False)  # fmt: skip
+        problems.append(jm.soften(mpc, 1.0))
+    with jax.enable_x64(True):
+        plans = solve(stacked(problems), rng.uniform(1, 5, (COUNT, n)))
+    assert (plans.status == jm.Status.SOLVED).all()
+    np.testing.assert_allclose(plans.inputs, 0, atol=1e-9)

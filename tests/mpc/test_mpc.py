@@ -177,7 +177,8 @@ class TestAnotherSolver:
     def test_states_kept(self, name):
         mpc, x0 = CASES[name](), start(name)
         cost, v = Stacked(mpc).solve(x0)
-        plan = jm.solve(mpc, x0, solver=FINE)
+        aim = np.zeros((mpc.horizon + 1, mpc.system.n))  # the program of `test_tracking`
+        plan = jm.solve(mpc, x0, reference=aim, solver=FINE)
         assert plan.status == jm.Status.SOLVED
         got = np.concatenate([np.ravel(plan.states), np.ravel(plan.inputs)])
         np.testing.assert_allclose(got, v, atol=1e-6 * (1 + np.abs(v).max()))
@@ -188,7 +189,8 @@ class TestAnotherSolver:
     def test_optimality(self, name):
         """KKT of the stacked problem: costates recovered by the adjoint leave no gradient in u."""
         mpc, x0 = CASES[name](), start(name)
-        stacked, plan = Stacked(mpc), jm.solve(mpc, x0, solver=FINE)
+        aim = np.zeros((mpc.horizon + 1, mpc.system.n))
+        stacked, plan = Stacked(mpc), jm.solve(mpc, x0, reference=aim, solver=FINE)
         assert plan.status == jm.Status.SOLVED
         v = stacked.from_inputs(x0, plan.inputs)
         y = plan.multipliers
@@ -238,7 +240,7 @@ class TestRiccati:
 
     def test_finite_horizon_recursion(self):
         """No terminal cost: the Riccati difference equation from P_N = 0."""
-        mpc = free(7)
+        mpc = free(7, np.zeros((3, 3)))  # the program of the test above
         A, B, P = mpc.system.A, mpc.system.B, np.zeros((3, 3))
         for _ in range(7):
             K = -np.linalg.solve(mpc.R + B.T @ P @ B, B.T @ P @ A)
@@ -685,7 +687,9 @@ def test_limits_that_a_state_breaks_before_any_input():
     ]  # fmt: skip
     assert broken_at_start(mpc, np.array([1.5, 1.9])) == ["sum = 3.4, above 3"]
     assert broken_at_start(replace(mpc, constrain_initial=False), np.array([9.0, 9.0])) == []
-    plan = jm.solve(replace(mpc, outputs=()), np.array([1.6, 0.0]), solver=PLAIN)
+    # With the rows of `problems.lecture`, whose program this is.
+    limited = replace(mpc, outputs=(), terminal_cost=np.eye(2), terminal_set=mpc.states)
+    plan = jm.Controller(limited, PLAIN)(np.array([1.6, 0.0])).plan
     assert plan.status == jm.Status.PRIMAL_INFEASIBLE
     with pytest.raises(ValueError, match="x0 has q = 1.6 rad, above 1.5. Start inside"):
-        jm.mpc.active_constraints(replace(mpc, outputs=()), plan)
+        jm.mpc.active_constraints(limited, plan)

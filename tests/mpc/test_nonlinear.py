@@ -401,6 +401,7 @@ def growing(x, u):
     return jnp.tanh(jnp.array([[0.6, 0.2], [0.1, 0.7]]) @ x + jnp.array([0.5, 1.0]) * u[0])
 
 
+@pytest.mark.slow  # its programs, stage by stage, are those of `test_interior_point.py`
 def test_the_best_dose_may_be_none(x64):
     """u ≥ 0 without another limit: all states, and all costs, are least for u = 0."""
     system = jm.LinearSystem(np.eye(2), np.zeros((2, 1)))

@@ -116,7 +116,7 @@ def stagewise(mpc, x0s):
     return jm.mpc.solve_stagewise(mpc, x0s)
 
 
-# Stage by stage `test_the_best_dose_may_be_none` of `test_nonlinear.py` is in the fast suite.
+# Stage by stage `test_interior_point.py` has some in the fast suite.
 CASES = [(jm.solve_many, 2, 2, 1.0, 1.0), (jm.solve_many, 2, 2, 1.0, INF)]
 SLOW = [(stagewise, 2, 1, 1.0, 1.0), (jm.solve_many, 4, 2, 1e3, 1.0), (stagewise, 3, 2, 1e-3, 1.0)]
 SLOW += [(jm.solve_many, 3, 2, 1.0, INF), (stagewise, 4, 2, 1e3, INF), (stagewise, 2, 1, 1.0, INF)]
@@ -132,7 +132,7 @@ def test_plans_that_dose_nothing(solve, n, m, unit, most):
     for system, x0s in positive_systems(3, n, m):
         states, inputs = jm.Box(np.zeros(n), np.full(n, 20 * unit)), jm.Box(0, most * unit)
         # As many rows as those of `draw`, with which they share a program.
-        free = jm.Outputs(np.zeros((2, n)), upper=np.full(2, INF), D=np.zeros((2, m)))
+        free = jm.Outputs(np.zeros((2, n)), *np.outer([-INF, INF], [1, 1]), D=np.zeros((2, m)))
         limits = {"states": states, "inputs": inputs, "outputs": free, "constrain_initial": False}
         mpc = jm.MPC(system, np.eye(n), 0.1 * np.eye(m), N, terminal_cost=np.eye(n), **limits)
         plans = solve(mpc, unit * x0s)

@@ -311,8 +311,8 @@ RECURSIONS = {
         (call_damped, {"damped_steps"}),
         (call_in_registers, {"in_registers"}),
         pytest.param(lambda: call_line_search(False), {"in_registers"}, marks=pytest.mark.slow),
-        (lambda: call_line_search(True), {"in_registers"}),
-        (lambda: call_recursions(jnp.float64), RECURSIONS),
+        pytest.param(lambda: call_line_search(True), {"in_registers"}, marks=pytest.mark.slow),
+        pytest.param(lambda: call_recursions(jnp.float64), RECURSIONS, marks=pytest.mark.slow),
         pytest.param(lambda: call_recursions(jnp.float32), RECURSIONS, marks=pytest.mark.slow),
     ],
     ids=[
