@@ -51,7 +51,7 @@ def test_plans_from_far_outside_soft_limits_are_solved():
         system, np.repeat([10.0, 1.0], k), 0.1 * np.ones(k), N, states=jm.Box(-limit, limit),
         inputs=jm.Box(-3 * np.ones(k), 3 * np.ones(k)), prestabilise=False,
     )  # fmt: skip
-    soft = jm.soften(mpc, 10.0)
+    soft = jm.soften(mpc, np.full(n, 10.0))
     x0s = rng.uniform(-2.5, 2.5, (count, 2 * k)) * limit
     with jax.enable_x64(True):
         plan = solve(stacked([soft] * COUNT), np.resize(x0s, (COUNT, n)))
@@ -86,17 +86,21 @@ def test_soft_rows_without_a_penalty_are_no_rows():
 
 def test_plans_that_dose_nothing():
     """u ≥ 0 alone: with A, B, x0 ≥ 0 all states, and all costs, grow with every input."""
-    rng, problems = np.random.default_rng(0), []
-    for _ in range(COUNT):
+    rng, problems, costs = np.random.default_rng(0), [], []
+    x0s = rng.uniform(1, 5, (COUNT, n))
+    for x in x0s:
         A = rng.uniform(0, 1, (n, n))
         A *= rng.uniform(0.5, 0.95) / np.abs(np.linalg.eigvals(A)).max()
         system = jm.LinearSystem(A, rng.uniform(0, 1, (n, m)), dt=0.05)
-        free = jm.Box(np.full(n, -np.inf), np.full(n, np.inf))
+        far = jm.Box(np.zeros(n), np.full(n, 100.0))
         doses = jm.Box(np.zeros(m), np.full(m, np.inf))
-        mpc = jm.MPC(system, np.eye(n), 0.1 * np.eye(m), N, states=free, inputs=doses,
+        mpc = jm.MPC(system, np.eye(n), 0.1 * np.eye(m), N, states=far, inputs=doses,
                      prestabilise=False)  # fmt: skip
-        problems.append(jm.soften(mpc, 1.0))
+        problems.append(jm.soften(mpc, np.ones(n)))
+        costs.append(sum(np.sum((np.linalg.matrix_power(A, k) @ x) ** 2) for k in range(N)))
     with jax.enable_x64(True):
-        plans = solve(stacked(problems), rng.uniform(1, 5, (COUNT, n)))
+        plans = solve(stacked(problems), x0s)
     assert (plans.status == jm.Status.SOLVED).all()
-    np.testing.assert_allclose(plans.inputs, 0, atol=1e-9)
+    np.testing.assert_allclose(plans.cost, costs, rtol=1e-8)
+    # The last inputs hardly cost anything.
+    np.testing.assert_allclose(plans.inputs[:, 0], 0, atol=1e-8)

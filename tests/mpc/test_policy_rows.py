@@ -204,11 +204,27 @@ def least_first_inputs(mpc: jm.MPC, states: np.ndarray) -> np.ndarray:
     return np.array(least)
 
 
-@pytest.mark.parametrize("policy", ["tube", pytest.param("affine", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("policy", ["tube", "affine"])
 def test_without_limits_the_nominal_inputs_are_those_of_the_lqr(policy):
-    mpc = robust(policy, terminal_set=None)
-    free, fastest = replace(mpc, states=None, inputs=None), {"iterations": 3000, "newton_steps": 0}
-    found = plans(free, STATES[:2], **fastest)  # to compile
+    """The condensed program, solved by DAQP."""
+    free = replace(robust(policy, terminal_set=None), states=None, inputs=None)
+    with enable_x64():
+        condensed = jm.Controller(free).condensed
+        for x0 in STATES[:2]:
+            qp = jax.tree.map(np.array, condensed.qp(jnp.asarray(x0)))
+            P = qp.P + 1e-12 * np.eye(len(qp.q))  # DAQP's programs are definite
+            sides = np.clip([qp.u, qp.l], -1e30, 1e30)
+            found = daqp.solve(P, qp.q, qp.A, *sides, np.zeros(len(qp.u), np.int32))
+            assert found[2] == 1
+            inputs = condensed.trajectory(x0, found[0])[1]
+            np.testing.assert_allclose(inputs[0], LAW.K @ x0, atol=1e-7)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("policy", ["tube", "affine"])
+def test_without_limits_plans_are_solved(policy):
+    free = replace(robust(policy, terminal_set=None), states=None, inputs=None)
+    found = plans(free, STATES[:2], differentiate="unrolled")  # the fastest to compile
     assert (found.status == jm.Status.SOLVED).all()
     np.testing.assert_allclose(found.inputs[:, 0], STATES[:2] @ LAW.K.T, atol=1e-7)
 
@@ -461,8 +477,7 @@ def test_soft_rows_rates_and_blocks(policy, fields):
     points = np.vstack([STATES[:4] + [0.1, 0.0], [4.5, 1.8]])
     least = least_cost_of_affine if policy == "affine" else least_cost_of_tube
     with enable_x64():
-        # Many steps of ADMM: Newton steps are half of what is compiled.
-        plan = jm.Controller(mpc, jm.ADMM(iterations=20_000, newton_steps=0, eps=1e-8)).plan
+        plan = jm.Controller(mpc).plan
         plans = jax.jit(jax.vmap(lambda x0: plan(x0, previous_input=before)))(points)
         for x0, solved, found in zip(points, plans.solved, plans.cost, strict=True):
             cost = least(mpc, x0, before)

@@ -117,6 +117,7 @@ def test_riccati_recursions_in_pieces_are_the_scan(kind):
             np.testing.assert_allclose(a / size, b / size, atol=1e-10)
 
 
+@pytest.mark.slow  # on GPUs; what it is made of is compared above
 def test_long_horizons_are_divided(monkeypatch):
     """Tracking by gains with products of their pieces, and its derivatives, are the scan's."""
     with jax.enable_x64(True):

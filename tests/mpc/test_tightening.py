@@ -201,7 +201,8 @@ def test_derivatives_of_tightened_bounds():
 
     with enable_x64():
         K, size, h = np.asarray(jm.lqr(SYSTEM, np.eye(2), 0.1).K), 0.15, 1e-6
-        of_K, of_size = jax.jacfwd(upper, argnums=(0, 1))(K, size)
+        upper = jax.jit(upper)
+        of_K, of_size = jax.jit(jax.jacfwd(upper, argnums=(0, 1)))(K, size)
         by_size = (upper(K, size + h) - upper(K, size - h)) / (2 * h)
         np.testing.assert_allclose(of_size, by_size, atol=1e-8)
         for i in range(2):

@@ -65,7 +65,7 @@ def test_values(name, n):
 
 @pytest.mark.parametrize("n", [3, pytest.param(13, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", FUNCTIONS)
-@pytest.mark.first(3)
+@pytest.mark.first(2)
 def test_derivatives(name, n):
     """Reverse, forward, and forward over reverse, under vmap: those of JAX's own routines."""
     with jax.enable_x64(True):
