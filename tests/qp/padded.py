@@ -17,23 +17,24 @@ INF = np.inf
 @jax.jit
 @partial(jax.vmap, in_axes=(0, None))
 def solve(qp, eps):
-    """Solutions of a batch; `COUNT` programs of (5, 12) with soft rows are a shape, too, of
-    `test_qp_units.py` and `test_projection.py`."""
     return jm.solve_qp(qp, jm.ADMM(eps=eps))
 
 
 def padded(qp):
     """Return the program with variables that no row holds and rows that hold nothing; a linear one
-    stays linear."""
+    stays linear, and hard rows are those of infinite weight."""
     m, n = qp.A.shape
     P, A = np.eye(VARIABLES) * np.any(qp.P), np.zeros((ROWS, VARIABLES))
     P[:n, :n], A[:m, :n] = qp.P, qp.A
     q, free = np.append(qp.q, np.zeros(VARIABLES - n)), np.full(ROWS - m, INF)
-    return jm.QP(P, q, A, np.append(qp.l, -free), np.append(qp.u, free))
+    linear = np.full(m, INF) if qp.soft_linear is None else qp.soft_linear
+    quadratic = np.zeros(m) if qp.soft_quadratic is None else qp.soft_quadratic
+    weights = np.append(linear, free), np.append(quadratic, np.zeros(ROWS - m))
+    return jm.QP(P, q, A, np.append(qp.l, -free), np.append(qp.u, free), *weights)
 
 
 def solutions(qps, eps=1e-6, dtype=float):
-    """Return the solutions of programs of one size with hard rows, in NumPy."""
+    """Return the solutions of programs of one size without balls, in NumPy."""
     parts = []
     for first in range(0, len(qps), COUNT):
         some = [padded(qps[i % len(qps)]) for i in range(first, first + COUNT)]

@@ -464,9 +464,9 @@ def test_triton_compiles_the_kernels(architecture, x64, monkeypatch):
     assert lowered(gradient, jnp.asarray(STATES), monkeypatch, compiler)
 
 
+@pytest.mark.slow  # the way of those without jax-triton
 @pytest.mark.filterwarnings("ignore:The Pallas Triton backend:DeprecationWarning")
 @pytest.mark.parametrize("soft", [False, True])
-@pytest.mark.first(1)
 def test_pallas_takes_the_kernels(soft, x64, monkeypatch):
     """Where jax-triton is not installed. Lowering needs no GPU."""
     mesh_module = pytest.importorskip("jax._src.mesh")

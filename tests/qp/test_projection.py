@@ -27,7 +27,6 @@ N, ROWS = 5, 12  # variables and rows of every program below
 BALLS = (3, 2)
 
 COARSE = jm.ADMM(iterations=3, newton_steps=0)
-solve_fine = lambda qp, eps: padded.solve(qp, np.asarray(eps, qp.q.dtype))  # of `COUNT`
 solve_coarse = jax.jit(
     jax.vmap(lambda qp, eps: jm.solve_qp(qp, replace(COARSE, eps=eps)), (0, None))
 )
@@ -57,6 +56,13 @@ def one(tree, i):
 
 def stacked(trees):
     return jax.tree.map(lambda *v: np.stack(v), *trees)
+
+
+def solve_fine(qp, eps):
+    """Solutions of a batch, of `COUNT` programs without balls by a program of other files."""
+    if qp.balls or qp.A.shape != (COUNT, ROWS, N):
+        return padded.solve(qp, np.asarray(eps, qp.q.dtype))
+    return padded.solutions([one(qp, i) for i in range(COUNT)], eps, qp.q.dtype)
 
 
 def weights(qp):
