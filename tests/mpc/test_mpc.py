@@ -522,7 +522,7 @@ class TestTypes:
     def test_integers(self):
         system = jm.LinearSystem(np.array([[1, 1], [0, 1]]), np.array([[0], [1]]))
         mpc = jm.MPC(system, np.eye(2, dtype=int), np.eye(1, dtype=int), 3)
-        plan = jm.solve(mpc, np.array([1, 0]), solver=PLAIN)
+        plan = jax.eval_shape(lambda x: jm.solve(mpc, x, solver=PLAIN), np.array([1, 0]))
         assert jnp.issubdtype(plan.inputs.dtype, jnp.floating)
 
 
