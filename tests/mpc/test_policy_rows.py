@@ -204,20 +204,44 @@ def least_first_inputs(mpc: jm.MPC, states: np.ndarray) -> np.ndarray:
     return np.array(least)
 
 
+def by_daqp(mpc: jm.MPC, x0: np.ndarray, before: np.ndarray | None = None) -> tuple:
+    """Return the inputs (N, m) and the cost of the condensed program, by DAQP: None and ∞ where its
+    rows leave nothing."""
+    with enable_x64():
+        c = jm.Controller(mpc).condensed
+        theta = np.append(x0, [] if before is None else before)
+        qp = jax.tree.map(np.array, c.qp(jnp.asarray(theta)))
+        still, (x, u) = np.zeros(len(qp.q)), c.trajectory(theta, np.zeros(len(qp.q)))
+    weights = [np.eye(2)] * mpc.horizon + [np.asarray(mpc.terminal_cost)]
+    constant = sum(v @ W @ v for v, W in zip(np.asarray(x), weights, strict=True))
+    constant += 0.1 * np.sum(np.asarray(u) ** 2)
+    soft = np.zeros(len(qp.u), bool) if qp.soft_linear is None else np.isfinite(qp.soft_linear)
+    count = soft.sum()
+    P, q, A = qp.P, qp.q, np.hstack([qp.A, np.zeros((len(qp.u), count))])
+    above, below = A.copy(), A.copy()
+    if count:  # Az ≤ u + e and Az ≥ l − e with e ≥ 0
+        pay = np.diag(qp.soft_quadratic[soft])
+        P = np.block([[P, np.zeros((len(q), count))], [np.zeros((count, len(q))), pay]])
+        q = np.append(q, qp.soft_linear[soft])
+        above[soft, len(still) :], below[soft, len(still) :] = -np.eye(count), np.eye(count)
+    slack = np.eye(len(q))[len(still) :]
+    G, free = np.vstack([above, below, slack]), np.full(len(qp.u), 1e30)
+    upper = np.concatenate([np.minimum(qp.u, 1e30), free, np.full(count, 1e30)])
+    lower = np.concatenate([-free, np.maximum(qp.l, -1e30), np.zeros(count)])
+    P = P + 1e-12 * np.eye(len(q))  # DAQP's programs are definite
+    found = daqp.solve(P, q, G, upper, lower, np.zeros(len(upper), np.int32))
+    if found[2] <= 0:
+        return None, np.inf
+    with enable_x64():
+        inputs = np.asarray(c.trajectory(theta, found[0][: len(still)])[1])
+    return inputs, found[1] + constant
+
+
 @pytest.mark.parametrize("policy", ["tube", "affine"])
 def test_without_limits_the_nominal_inputs_are_those_of_the_lqr(policy):
-    """The condensed program, solved by DAQP."""
     free = replace(robust(policy, terminal_set=None), states=None, inputs=None)
-    with enable_x64():
-        condensed = jm.Controller(free).condensed
-        for x0 in STATES[:2]:
-            qp = jax.tree.map(np.array, condensed.qp(jnp.asarray(x0)))
-            P = qp.P + 1e-12 * np.eye(len(qp.q))  # DAQP's programs are definite
-            sides = np.clip([qp.u, qp.l], -1e30, 1e30)
-            found = daqp.solve(P, qp.q, qp.A, *sides, np.zeros(len(qp.u), np.int32))
-            assert found[2] == 1
-            inputs = condensed.trajectory(x0, found[0])[1]
-            np.testing.assert_allclose(inputs[0], LAW.K @ x0, atol=1e-7)
+    for x0 in STATES[:2]:
+        np.testing.assert_allclose(by_daqp(free, x0)[0][0], LAW.K @ x0, atol=1e-7)
 
 
 @pytest.mark.slow
@@ -457,34 +481,39 @@ def least_cost_of_tube(mpc: jm.MPC, x0: np.ndarray, before: np.ndarray) -> float
 SOFT = jm.Soft([[0.3, 1.0]], lower=[-0.5], upper=[0.5], rho=2.0, quadratic=1.0)
 RATES = {"input_rate_limit": [1.1]}
 MORE = [
-    ("tube", {"soft": SOFT, **RATES}),
-    *(
-        pytest.param(policy, fields, marks=pytest.mark.slow)
-        for policy, fields in [
-            ("affine", {"soft": SOFT}), ("affine", {"control_horizon": 2}), ("affine", RATES),
-            ("affine", {"soft": SOFT, "control_horizon": (1, 2), **RATES}),
-            ("tube", {"soft": SOFT}), ("tube", RATES),
-        ]
-    ),
+    ("tube", {"soft": SOFT, **RATES}), ("affine", {"soft": SOFT}),
+    ("affine", {"control_horizon": 2}), ("affine", RATES),
+    ("affine", {"soft": SOFT, "control_horizon": (1, 2), **RATES}), ("tube", {"soft": SOFT}),
+    ("tube", RATES),
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("policy", "fields"), MORE)
-def test_soft_rows_rates_and_blocks(policy, fields):
+def solved(mpc: jm.MPC, x0: np.ndarray, before: np.ndarray) -> tuple:
+    """Return the inputs and the cost of the plan, ∞ where there is none."""
+    with enable_x64():
+        plan = jm.Controller(mpc).plan(x0, previous_input=before)
+    return plan.inputs, float(plan.cost) if plan.solved else np.inf
+
+
+@pytest.mark.parametrize(
+    ("plan", "policy", "fields"),
+    [
+        (by_daqp, "tube", {"soft": SOFT, **RATES}),
+        *(pytest.param(solved, *case, marks=pytest.mark.slow) for case in MORE),
+    ],
+)
+def test_soft_rows_rates_and_blocks(plan, policy, fields):
     """The least cost is that of DAQP with all vertices; a map says where there is a plan."""
     mpc = robust(policy, disturbance=jm.Box([-0.1, -0.05], [0.05, 0.1]), **fields)
     before, costs = np.array([-0.2]), []
     points = np.vstack([STATES[:4] + [0.1, 0.0], [4.5, 1.8]])
     least = least_cost_of_affine if policy == "affine" else least_cost_of_tube
-    with enable_x64():
-        plan = jm.Controller(mpc).plan
-        plans = jax.jit(jax.vmap(lambda x0: plan(x0, previous_input=before)))(points)
-        for x0, solved, found in zip(points, plans.solved, plans.cost, strict=True):
-            cost = least(mpc, x0, before)
-            assert solved == np.isfinite(cost)
-            if np.isfinite(cost):
-                np.testing.assert_allclose(found, cost, rtol=1e-6)
-            costs.append(cost)
+    for x0 in points:
+        found, cost = plan(mpc, x0, before)[1], least(mpc, x0, before)
+        assert np.isfinite(found) == np.isfinite(cost)
+        if np.isfinite(cost):
+            np.testing.assert_allclose(found, cost, rtol=1e-6)
+        costs.append(cost)
     assert 3 <= np.isfinite(costs).sum() < len(points)
     if mpc.rate_limited:
         points = np.column_stack([points, np.repeat(before, len(points))])
