@@ -591,6 +591,16 @@ def test_derivatives_of_a_batch_of_plans_without_limits():
         np.testing.assert_allclose(found, np.tile(np.eye(2) / 2, (3, 1, 1)), atol=1e-5)
 
 
+def test_gradients_of_all_data_are_traced():
+    """Of the problem and the state; `TestEveryField` of `test_derivative.py` has values."""
+    cost = lambda mpc, x: jm.solve(mpc, x).cost
+    mpc = jax.tree.map(np.asarray, problems.lecture())
+    gradient = jax.vmap(jax.grad(cost, argnums=(0, 1)), (None, 0))
+    of_mpc, of_x = jax.eval_shape(gradient, mpc, np.zeros((4, 2)))
+    assert jax.tree.structure(of_mpc) == jax.tree.structure(mpc)
+    assert of_mpc.system.A.shape == (4, 2, 2) and of_x.shape == (4, 2)
+
+
 @pytest.mark.slow
 def test_gradients_are_finite_with_half_open_rows():
     """A polytope's rows have no lower bound: its gradients equal those of the same box."""

@@ -256,6 +256,12 @@ def test_wrong_stage_weights(weights, message):
         replace(mpc, stage_weights=weights).validate()
 
 
+def test_gradients_after_steps_of_admm_alone_are_traced():
+    """With rows of each kind, at some of the stages."""
+    cost = lambda x: solve_stagewise(problem(), x, solver=jm.ADMM(5, newton_steps=0)).cost
+    assert jax.eval_shape(jax.grad(cost), X0).shape == (n,)
+
+
 @pytest.mark.slow  # beside limits: `test_varying.py`
 def test_stage_weights():
     """Without limits the plan is a least-squares solution, here numpy's; both solvers find it."""
