@@ -6,6 +6,16 @@ import problems
 import pytest
 
 import jaxmpc as jm
+from jaxmpc.qp import jax_transformations
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _as_of_many():
+    """A program of 64 states does as one of more does: a few steps of all of them, in blocks, go
+    first. It compiles in less time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(jax_transformations, "BLOCK", 32)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -15,8 +25,8 @@ def states():
 
 @pytest.fixture(scope="module", params=["float32", pytest.param("float64", marks=pytest.mark.slow)])
 def plans(request, states):
-    # More than 64: a few steps of all of them go first. A program of `test_reuse.py`, too.
-    return jm.solve_many(problems.joint_o_inf(10), states, dtype=request.param, chunk=96)
+    # A program of `test_reuse.py`, too.
+    return jm.solve_many(problems.joint_o_inf(10), states, dtype=request.param, chunk=64)
 
 
 @pytest.mark.slow
@@ -63,10 +73,10 @@ def test_plans_are_those_of_solve(plans, states):
 
 def test_a_state_with_nan_is_marked_and_changes_nothing_else(states):
     mpc = problems.joint_o_inf(10)
-    clean = jm.solve_many(mpc, states[:200], chunk=96)  # the program of `plans`
+    clean = jm.solve_many(mpc, states[:200], chunk=64)  # the program of `plans`
     spoilt = states[:200].copy()
     spoilt[7] = np.nan
-    dirty = jm.solve_many(mpc, spoilt, chunk=96)
+    dirty = jm.solve_many(mpc, spoilt, chunk=64)
     others = np.arange(200) != 7
     assert dirty.status[7] == jm.Status.NON_FINITE
     assert np.isnan(dirty.inputs[7]).all() and np.isnan(dirty.cost[7])
@@ -90,7 +100,7 @@ def test_solved_and_sentence():
     """Of one plan, and of many: one truth value each, and a print of a few lines."""
     mpc = problems.joint_o_inf(10)
     some = np.resize([[0.1, 0.0], [1.6, 2.1], [0.0, 0.0]], (200, 2))
-    plans = jm.solve_many(mpc, some, chunk=96)  # the program of `plans`
+    plans = jm.solve_many(mpc, some, chunk=64)  # the program of `plans`
     np.testing.assert_array_equal(plans.solved, np.resize([True, False, True], 200))
     plan = jax.tree.map(lambda v: v[0], plans)
     assert plan.solved and plan.sentence == jm.Status.SOLVED.sentence
@@ -105,9 +115,9 @@ def test_solved_and_sentence():
 
 def test_plans_that_stay_on_the_device_are_those_on_the_host(states):
     mpc = problems.joint_o_inf(10)
-    for count in (96, 150):  # one chunk, and two of which the last is not full
+    for count in (64, 120):  # one chunk, and two of which the last is not full
         some = states[150 : 150 + count]
-        host = jm.solve_many(mpc, some, chunk=96)
-        there = jm.solve_many(mpc, some, chunk=96, to_host=False)
+        host = jm.solve_many(mpc, some, chunk=64)
+        there = jm.solve_many(mpc, some, chunk=64, to_host=False)
         assert there.inputs.dtype == np.float64 and isinstance(there.inputs, jax.Array)
         jax.tree.map(np.testing.assert_array_equal, host, there)
