@@ -297,7 +297,7 @@ RECURSIONS = {
 @pytest.mark.parametrize(
     ("calls", "names"),
     [
-        (lambda: call_admm(n=7, m=11, B=5, stages=2), {"admm_steps"}),
+        (lambda: call_admm(n=7, m=40, B=5, stages=2), {"admm_steps"}),
         (lambda: call_admm(n=10, m=30, B=4, soft=True, balls=(2, 3)), {"admm_steps"}),
         pytest.param(
             lambda: call_admm(n=8, m=40, B=18, stages=2, dtype=jnp.float64),
