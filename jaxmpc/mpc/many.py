@@ -217,7 +217,7 @@ class Batch:
 
         if not self.to_host:
             self.answer = self._left_there(program, arguments, size)
-        elif len(index) == len(self.x) <= size and self.devices is None:
+        elif self.answer is None and len(index) == len(self.x) <= size and self.devices is None:
             self.answer = first_rows(parts(index)[0], len(index))
         else:
             side_by_side(put, pieces, self.together)

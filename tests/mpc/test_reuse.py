@@ -103,6 +103,12 @@ def test_plans_are_those_of_the_solver(mpc, states, solved, few):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("chunk", [COUNT, 2 * COUNT])
+def test_one_chunk_of_all_states(mpc, states, solved, few, chunk):
+    same_plans(jm.solve_many(mpc, states, chunk=chunk), solved)
+
+
+@pytest.mark.slow
 def test_most_follow(mpc, states, solved, few):
     """More than half of the feasible states need no solver, in cells of 16 states each."""
     good = states[solved.status == jm.Status.SOLVED]
