@@ -25,9 +25,15 @@ CASES = {
 }  # fmt: skip
 
 
+def worth_rays(monkeypatch, count):
+    """Cast rays for so many points of two coordinates, on any device."""
+    for name in ("MANY", "MANY_ELSEWHERE"):
+        monkeypatch.setattr(hull_labels, name, count)
+
+
 @pytest.fixture
 def always(monkeypatch):
-    monkeypatch.setattr(hull_labels, "MANY", 0)
+    worth_rays(monkeypatch, 0)
 
 
 def points_of(name, count):
@@ -42,7 +48,7 @@ def test_labels_and_proofs(name, monkeypatch):
     mpc, _, view = CASES[name]
     points = points_of(name, 600)
     expected = jm.map_feasible_set(mpc, points, chunk=64, **view).label
-    monkeypatch.setattr(hull_labels, "MANY", 0)
+    worth_rays(monkeypatch, 0)
     problem = FeasibilityProblem.of(mpc, **view)
     assert Hull.of(problem) is not None
     labels = jm.map_feasible_set(mpc, points, chunk=64, **view).labels
@@ -122,7 +128,7 @@ def test_points_that_are_not_finite(always):
 
 
 def test_a_problem_keeps_its_cones(monkeypatch):
-    monkeypatch.setattr(hull_labels, "MANY", 500)
+    worth_rays(monkeypatch, 500)
     problem = FeasibilityProblem.of(problems.lecture())
     points = points_of("lecture", 600)
     assert hull_labels.hull_for(problem, 100) is None
@@ -136,7 +142,7 @@ def test_a_problem_keeps_its_cones(monkeypatch):
 
 def test_labels_and_bounds_share_their_rays(monkeypatch):
     """Rays are sent once for the labels, and not again for bounds that are no closer."""
-    monkeypatch.setattr(hull_labels, "MANY", 60)
+    worth_rays(monkeypatch, 60)
     problem = FeasibilityProblem.of(problems.lecture())
     mapped = jm.map_feasible_set(problem, points_of("lecture", 600), chunk=64)
     monkeypatch.setattr(rays, "close_gap", lambda *_, **__: pytest.fail("sent again"))
