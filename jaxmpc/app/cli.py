@@ -72,13 +72,23 @@ def main(
 
     session: entered once the options are known to be right, before JAX is imported.
     """
-    argv = list(sys.argv[1:] if argv is None else argv)
     for name in ("stdout", "stderr"):  # None where the shell has closed it, as by >&-
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))
     for stream in (sys.stdout, sys.stderr):  # what their encoding lacks becomes "?"
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
+    try:
+        try:
+            return exit_code(list(sys.argv[1:] if argv is None else argv), session)
+        finally:  # what is written at the end of the process cannot be told from an error
+            sys.stdout.flush()
+    except BrokenPipeError:
+        return without_reader()
+
+
+def exit_code(argv: Sequence[str], session: Session) -> int:
+    """Run a command and return its exit code, as `main` does."""
     if argv == ["--version"]:
         print(f"jaxmpc {jaxmpc.__version__}")
         return 0
@@ -107,10 +117,7 @@ def main(
     if everywhere.json:
         found = as_json(options, outcome, said.getvalue(), begun)
         name = " ".join(words[: 2 if words[0] == "tune" else 1])
-        try:
-            print(json.dumps({"command": name} | found, indent=2), flush=True)
-        except BrokenPipeError:
-            return without_reader()
+        print(json.dumps({"command": name} | found, indent=2))
     return outcome.code
 
 

@@ -2,6 +2,7 @@
 
 import io
 import json
+import os
 import shlex
 import shutil
 import signal
@@ -618,12 +619,14 @@ def test_verify_a_recursion_report(tmp_path, capsys):
     assert "cannot be read" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("words", [["sweep", "--help"], ["init"], ["init", "--json"]])
-def test_a_reader_that_has_ended_ends_a_command_silently(words, tmp_path):
-    """As in `jaxmpc sweep --help | head -1`."""
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+@pytest.mark.parametrize("words", ["sweep --help", "--help", "--version", "init", "init --json"])
+def test_a_reader_that_has_ended_ends_a_command_silently(words, unbuffered, tmp_path):
+    """As in `jaxmpc sweep --help | head -1`, whether output is written at once or at the end."""
     with subprocess.Popen(
-        [sys.executable, "-m", "jaxmpc", *words],
+        [sys.executable, "-m", "jaxmpc", *words.split()],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path,
+        env=os.environ | {"PYTHONUNBUFFERED": unbuffered},
     ) as process:  # fmt: skip
         assert process.stdout is not None and process.stderr is not None
         process.stdout.close()
