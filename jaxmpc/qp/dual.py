@@ -295,7 +295,7 @@ def dual_search(
     none, constants, every = jnp.int32(0), (dual, cold), min(*dual.A.shape)
     if has_kernels(len(dual.S)):
         most = min(every, KERNEL_ROWS)
-        point, optimal = dual_search_kernel(dual, cold, point, none, go_on, steps)
+        point, optimal = dual_search_kernel(dual, cold, point, go_on, steps)
     else:
         most = most_rows(dual.A)
         state = DualSearch(point, none, go_on, jnp.asarray(False))
@@ -335,12 +335,12 @@ def few_steps(measured: bool, p: ScaledProgram, y: Array) -> Pair:
 
 
 def single_step(dual: Dual, point: DualPoint) -> DualPoint:
-    """Return the point after one step, in which rows join singly."""
-    true = jnp.asarray(True)
-    if has_kernels(len(dual.S)):
-        one = MostSteps(JOINTLY + 1, 0)
-        return dual_search_kernel(dual, point, point, jnp.int32(JOINTLY), true, one)[0]
-    return dual_step(dual, point, true, most_rows(dual.A))[0]
+    """Return the point after one step, in which rows join singly.
+
+    (Not by the kernel, which tells the change of the multipliers by their difference. Where limits
+    are far below q the change may be less than the rounding of the multipliers.)"""
+    most = KERNEL_ROWS if has_kernels(len(dual.S)) else MOST_ROWS
+    return dual_step(dual, point, jnp.asarray(True), min(*dual.A.shape, most))[0]
 
 
 def _search_step(
@@ -418,10 +418,10 @@ def sides(rows: int) -> list[int]:
 
 
 def dual_search_kernel(
-    dual: Dual, cold: DualPoint, point: DualPoint, taken: Array, go_on: Array, steps: MostSteps
+    dual: Dual, cold: DualPoint, point: DualPoint, go_on: Array, steps: MostSteps
 ) -> tuple[DualPoint, Array]:
-    """Return `dual_search` of one instance, in float64, that has `taken` steps already, by a kernel
-    for NVIDIA GPUs. `vmap` for many: one program an instance.
+    """Return `dual_search` of one instance, in float64, by a kernel for NVIDIA GPUs. `vmap` for
+    many: one program an instance.
 
     As a loop of XLA each step is some twenty launches, and all instances of a group wait for the
     largest system. Here an instance takes all its steps within one program and leaves when it is
@@ -429,7 +429,7 @@ def dual_search_kernel(
     own. The system is solved in as many pivots as W has rows.
     """
     rows = min(*dual.A.shape, KERNEL_ROWS)
-    flags = jnp.stack([taken, go_on.astype(jnp.int32), jnp.int32(0)])
+    flags = jnp.stack([jnp.int32(0), go_on.astype(jnp.int32), jnp.int32(0)])
     y, v = point.y, point.v
     for side in sides(rows):
         last = side >= rows == min(*dual.A.shape)

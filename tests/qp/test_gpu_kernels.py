@@ -105,7 +105,7 @@ def searches(case, first, more):
 
     def kernel(bounds, cold, point):
         dual, true = Dual(made.A, made.S, bounds, limit), jnp.asarray(True)
-        return dual_search_kernel(dual, cold, point, jnp.int32(0), true, steps)
+        return dual_search_kernel(dual, cold, point, true, steps)
 
     return [jax.jit(jax.vmap(search))(bounds, cold, point) for search in (loop, kernel)]
 
@@ -228,7 +228,7 @@ def call_search(**case):
 
     def search(bounds, cold):
         dual = Dual(made.A, made.S, bounds, limit)
-        return dual_search_kernel(dual, cold, cold, jnp.int32(0), true, steps)
+        return dual_search_kernel(dual, cold, cold, true, steps)
 
     points = jax.jit(jax.vmap(lambda q, b: DualPoint.of(made.A, q, b, jnp.zeros_like(b.l))))
     cold = points(q, bounds)
@@ -516,6 +516,16 @@ def test_without_a_compiler_there_are_no_kernels_and_one_line_says_so(monkeypatc
         assert jax_transformations.on_gpu()
     finally:
         clear()
+
+
+def test_limits_far_below_the_cost(x64, monkeypatch):
+    """min ½p|z|² + q'z with |z| ≤ 1 and |q| = 1e16 p: what brings z to its limits is less than the
+    rounding of the multipliers, in which the kernel's search tells it."""
+    monkeypatch.setattr(dual, "has_kernels", lambda rows: True)
+    box, q = np.eye(2), np.array([-1e6, 5e5])
+    found = jax.jit(lambda q: jm.solve_qp(jm.QP(1e-10 * box, q, box, -np.ones(2), np.ones(2))))(q)
+    assert found.status == jm.Status.SOLVED
+    np.testing.assert_allclose(found.z, [1, -1], rtol=0, atol=1e-9)
 
 
 def test_no_kernels_where_programs_run_on_a_cpu_beside_a_gpu(tmp_path, monkeypatch):
