@@ -52,13 +52,13 @@ def looped(cast):
 
 
 CALLS = {
-    "plan": lambda c: jm.solve(problem(c), c(STATE), c(STATE), previous_input=c([0.0])).inputs,
     "map": mapped,
     "program": lambda c: program(c).dense(),
     "inside jit": lambda c: jax.jit(jax.tree.leaves)(jm.mpc.soften(problem(c), c(50.0))),
     "set": lambda c: jm.Polytope(c([[1, 0], [0, 1], [-1, -1]]), c([1, 1, 1])).volume(),
 }
 SLOW = {
+    "plan": lambda c: jm.solve(problem(c), c(STATE), c(STATE), previous_input=c([0.0])).inputs,
     "plans": lambda c: jm.solve_many(problem(c), c(STATES)).inputs,
     "solution": lambda c: jm.solve_qp(program(c)).z,
     "margin": lambda c: jm.qp.feasibility_margin(program(c), c([1, 2]))[0],

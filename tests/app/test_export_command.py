@@ -27,6 +27,7 @@ def test_code_compiles_as_printed(law, tmp_path, capsys):
     assert abs(u + 2) < 1e-6 and status in (1, 2)
 
 
+@pytest.mark.slow
 def test_a_program_of_jax(tmp_path, capsys):
     pytest.importorskip("flatbuffers")
     cli.main(["export", "--horizon", "4", "--law", "jax", "--output", str(tmp_path / "new")])

@@ -518,6 +518,7 @@ def test_without_a_compiler_there_are_no_kernels_and_one_line_says_so(monkeypatc
         clear()
 
 
+@pytest.mark.slow
 def test_limits_far_below_the_cost(x64, monkeypatch):
     """min ½p|z|² + q'z with |z| ≤ 1 and |q| = 1e16 p: what brings z to its limits is less than the
     rounding of the multipliers, in which the kernel's search tells it."""
