@@ -131,7 +131,7 @@ class DualPoint:
 
 def most_rows(A: Array) -> int:
     """Return the number of rows that W may hold: no more than n are independent."""
-    return min(*A.shape, MOST_ROWS)
+    return min(*A.shape, KERNEL_ROWS if has_kernels(len(A)) else MOST_ROWS)
 
 
 def dual_step(dual: Dual, point: DualPoint, singly: Array, most: int) -> tuple[DualPoint, Array]:
@@ -293,11 +293,10 @@ def dual_search(
     too many for W, it begins once more from `cold`, the point without multipliers, with rows that
     join singly."""
     none, constants, every = jnp.int32(0), (dual, cold), min(*dual.A.shape)
+    most = most_rows(dual.A)
     if has_kernels(len(dual.S)):
-        most = min(every, KERNEL_ROWS)
         point, optimal = dual_search_kernel(dual, cold, point, go_on, steps)
     else:
-        most = most_rows(dual.A)
         state = DualSearch(point, none, go_on, jnp.asarray(False))
         step = partial(_search_step, steps, most)
         end = repeat_while(lambda s: s.open, step, constants, state)
@@ -339,8 +338,7 @@ def single_step(dual: Dual, point: DualPoint) -> DualPoint:
 
     (Not by the kernel, which tells the change of the multipliers by their difference. Where limits
     are far below q the change may be less than the rounding of the multipliers.)"""
-    most = KERNEL_ROWS if has_kernels(len(dual.S)) else MOST_ROWS
-    return dual_step(dual, point, jnp.asarray(True), min(*dual.A.shape, most))[0]
+    return dual_step(dual, point, jnp.asarray(True), most_rows(dual.A))[0]
 
 
 def _search_step(
