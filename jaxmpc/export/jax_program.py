@@ -1,6 +1,5 @@
 """A controller as a stored program of JAX (StableHLO), for other processes, languages and years."""
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +50,7 @@ def export_jax(
     try:
         jax.devices("cpu")
     except RuntimeError:
-        fail("JAX_PLATFORMS", f"{os.environ['JAX_PLATFORMS']}", "Add the platform cpu to it")
+        fail("JAX_PLATFORMS", f"only {jax.default_backend()}", "Add the platform cpu to it")
     (path,) = prepared_paths(path.parent, [path.name], overwrite)
     n, m = mpc.system.n, mpc.system.m
 
