@@ -53,8 +53,6 @@ MAPS = 30_000
 
 
 def pytest_configure(config):
-    about = "compared: about the comparison of robots with their files as they are loaded"
-    config.addinivalue_line("markers", about)
     # A program that another worker is about to write; this one compiles it then.
     config.addinivalue_line("filterwarnings", "ignore:Error reading persistent compilation cache")
 

@@ -6,16 +6,8 @@ import problems
 import pytest
 
 import jaxmpc as jm
-from jaxmpc.qp import jax_transformations
 
-
-@pytest.fixture(autouse=True, scope="module")
-def _as_of_many():
-    """A program of 64 states does as one of more does: a few steps of all of them, in blocks, go
-    first. It compiles in less time."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(jax_transformations, "BLOCK", 32)
-        yield
+pytestmark = pytest.mark.usefixtures("as_of_many")
 
 
 @pytest.fixture(scope="module")

@@ -9,19 +9,9 @@ import jaxmpc as jm
 from jaxmpc.mpc import many
 from jaxmpc.mpc.condense import in_float64
 from jaxmpc.mpc.controller import Controller
-from jaxmpc.qp import jax_transformations
 
 COUNT = 1024
-pytestmark = pytest.mark.cpu
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _as_of_many():
-    """A program of 64 states does as one of more does: a few steps of all of them, in blocks, go
-    first. It compiles in less time."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(jax_transformations, "BLOCK", 32)
-        yield
+pytestmark = [pytest.mark.cpu, pytest.mark.usefixtures("as_of_many")]
 
 
 @pytest.fixture

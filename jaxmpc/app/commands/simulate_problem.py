@@ -83,18 +83,18 @@ def hard_outputs(mpc: MPC, states: np.ndarray, inputs: np.ndarray) -> list[tuple
     made there, or a step before, holds them; with the states (B, T + 1, n) where u plays no part
     and the last plan holds the last state."""
     points = np.concatenate([states[:, :-1], inputs], axis=-1)
-    found = list[tuple[Any, np.ndarray]]()
+    m, found = inputs.shape[-1], list[tuple[Any, np.ndarray]]()
     for rows in as_tuple("outputs", mpc.outputs, Outputs):
         stages = output_stages(mpc, rows)
         if not stages or min(stages) > 1:
             continue
-        C, D = np.asarray(rows.C), None if rows.D is None else np.asarray(rows.D)
+        C = np.asarray(rows.C)
+        D = np.zeros((len(C), m)) if rows.D is None else np.asarray(rows.D)
         lower, upper = (
             np.full(len(C), free) if end is None else np.asarray(end)
             for end, free in ((rows.lower, -np.inf), (rows.upper, np.inf))
         )
-        of_states = 1 in stages and (D is None or not D.any())
-        D = np.zeros((len(C), inputs.shape[-1])) if D is None else D
+        of_states = 1 in stages and not D.any()
         held = (C, lower, upper) if of_states else (np.hstack([C, D]), lower, upper)
         found.append((held, (states if of_states else points)[:, min(stages) :]))
     return found
