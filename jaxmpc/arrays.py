@@ -27,6 +27,7 @@ def host_array(argument: str, value: Any, *, copy: bool = True) -> np.ndarray:
     All NumPy code (LPs, qhull, Riccati) calls it, so it computes in float64 in either mode of JAX.
     """
     require_untraced(argument, value)
+    value = of_known_type(value)
     require_real(argument, value)
     return np.asarray(value).astype(np.float64, copy=copy)
 
@@ -45,12 +46,23 @@ def dimensions(value: Any) -> int | None:
 
 
 def of_known_type(value: Any) -> Any:
-    """Return NumPy numbers of a type that JAX does not have as float64, anything else as it is: of
-    the other byte order, as in files of other machines, or longer than eight bytes."""
+    """Return arrays that JAX does not read as NumPy arrays of a type that it has, anything else as
+    it is: those of other libraries (tables of pandas, tensors, SciPy's sparse matrices), and NumPy
+    numbers of the other byte order, as in files of other machines, or longer than eight bytes, as
+    float64."""
+    if _of_another_library(value):
+        value = value.toarray() if hasattr(value, "toarray") else np.asarray(value)
     if isinstance(value, np.ndarray | np.generic) and value.dtype.kind in "iuf":
         if not value.dtype.isnative or value.dtype.itemsize > 8:
             return value.astype(np.float64)
     return value
+
+
+def _of_another_library(value: Any) -> bool:
+    """Return whether a value is an array of neither NumPy nor JAX that can be read as one."""
+    if isinstance(value, np.ndarray | np.generic | jax.Array) or hasattr(value, "__jax_array__"):
+        return False
+    return hasattr(value, "__array__") or hasattr(value, "toarray")
 
 
 def numpy_array(value: Any) -> np.ndarray:
@@ -60,8 +72,9 @@ def numpy_array(value: Any) -> np.ndarray:
 
 
 def store_floats(instance: Any, *names: str) -> None:
-    """Make arrays of floats of the named fields of a frozen dataclass where they are lists, or
-    NumPy arrays of whole numbers: one leaf each, which can be differentiated and stacked.
+    """Make arrays of floats of the named fields of a frozen dataclass where they are lists, arrays
+    of other libraries or NumPy arrays of whole numbers: one leaf each, which can be differentiated
+    and stacked.
 
     All else stays as it is: numbers, JAX's arrays, the placeholders by which JAX rebuilds an
     object, and what is no array of numbers, which `validate` refuses. Raises ValueError for rows of

@@ -168,12 +168,15 @@ def require_real(argument: str, value: Any) -> None:
         cure = "Give numbers in their place, by filled(...), or leave these rows out"
         fail(argument, "is a masked array that hides entries", cure)
     try:
-        array = value if hasattr(value, "ndim") else np.asarray(value)
+        array = value if isinstance(getattr(value, "dtype", None), np.dtype) else np.asarray(value)
     except (TypeError, ValueError):
         fail(argument, f"{shown(value)} is not an array of numbers", "Give rows of equal length")
     if array.dtype.kind not in "biuf" and array.dtype.name != "bfloat16":
         found = shown(value) if np.ndim(array) == 0 else f"entries of type {array.dtype}"
-        fail(argument, f"{found} where real numbers are needed", "Give an array or nested lists")
+        cure = "Give an array or nested lists of them"
+        if np.ndim(array) and array.dtype.kind in "OSU":
+            cure = "Make numbers of them: np.asarray(..., dtype=float)"
+        fail(argument, f"{found} where real numbers are needed", cure)
 
 
 def _hides(value: Any) -> bool:

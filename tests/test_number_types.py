@@ -1,12 +1,14 @@
-"""Numbers of types that JAX does not have: results are those of the same numbers in float64.
+"""Numbers that JAX does not read: results are those of the same numbers in float64.
 
-Files hold them: `.mat`, FITS and HDF5 of machines with the other byte order, `np.longdouble`.
+Files hold them: `.mat`, FITS and HDF5 of machines with the other byte order, `np.longdouble`; other
+libraries do: tables of pandas, tensors of torch, sparse matrices of SciPy.
 """
 
 from dataclasses import replace
 
 import jax
 import numpy as np
+import pandas as pd
 import pytest
 import scipy.sparse
 
@@ -68,11 +70,44 @@ SLOW = {
 }
 
 
+class Tensor:
+    """An array as torch has it: NumPy reads it, its type is none of NumPy's."""
+
+    def __init__(self, values):
+        self.values, self.dtype = np.asarray(values), "tensors.float64"
+        self.shape, self.ndim = self.values.shape, self.values.ndim
+
+    def __array__(self, dtype=None, copy=None):
+        return np.asarray(self.values, dtype)
+
+    def __len__(self):
+        return len(self.values)
+
+    def __getitem__(self, index):
+        return Tensor(self.values[index])
+
+
+def table(values):
+    return {1: pd.Series, 2: pd.DataFrame}.get(np.ndim(values), np.asarray)(values)
+
+
+def sparse_matrix(values):
+    return scipy.sparse.csc_array(values) if np.ndim(values) == 2 else np.asarray(values)
+
+
+KINDS = {
+    "other byte order": lambda v: np.asarray(v).astype(">f8"),
+    "longdouble": lambda v: np.asarray(v).astype(np.longdouble),
+    "table": table,
+    "tensor": Tensor,
+    "sparse": sparse_matrix,
+}
+
+
 def same(call):
     wanted = call(np.asarray)
-    for dtype in (">f8", np.longdouble):
-        found = call(lambda v, dtype=dtype: np.asarray(v).astype(dtype))
-        jax.tree.map(np.testing.assert_array_equal, found, wanted)
+    for cast in KINDS.values():
+        jax.tree.map(np.testing.assert_array_equal, call(cast), wanted)
 
 
 @pytest.mark.parametrize("call", CALLS.values(), ids=CALLS)
@@ -84,3 +119,16 @@ def test_results_are_those_in_float64(call):
 @pytest.mark.parametrize("call", SLOW.values(), ids=SLOW)
 def test_more_results_are_those_in_float64(call):
     same(call)
+
+
+@pytest.mark.parametrize("entry", [object(), "a", 1j])
+def test_entries_that_are_no_numbers(entry):
+    with pytest.raises(ValueError, match="x0s: entries of type .* where real numbers are needed"):
+        jm.map_feasible_set(problem(np.asarray), np.full((2, 3), entry))
+
+
+def test_the_cure_for_numbers_in_an_array_of_objects():
+    mixed = np.array([[0.5, 0.1, 0.0, "a name"]], dtype=object)[:, :3]
+    with pytest.raises(ValueError, match=r"np.asarray\(..., dtype=float\)"):
+        jm.map_feasible_set(problem(np.asarray), mixed)
+    assert jm.map_feasible_set(problem(np.asarray), np.asarray(mixed, dtype=float)).label.size == 1

@@ -351,8 +351,8 @@ class QP:
         multipliers again.
         """
         for name, value in (("P", P), ("q", q), *(() if G is None else (("G", G), ("h", h)))):
-            require_real(name, dense(value))
-        host = lambda v: np.asarray(dense(v), dtype=float)
+            require_real(name, of_known_type(value))
+        host = lambda v: np.asarray(of_known_type(v), dtype=float)
         P, q = host(P), host(q).ravel()
         n = q.size
         free, rows = np.full(n, np.inf), [(np.zeros((0, n)), np.zeros(0), np.zeros(0))]
@@ -370,7 +370,7 @@ class QP:
 
     def dense(self) -> "QP":
         """Return the program with sparse matrices made dense, in types that JAX has."""
-        return jax.tree.map(of_known_type, replace(self, P=dense(self.P), A=dense(self.A)))
+        return jax.tree.map(of_known_type, self)
 
     def validate(self) -> None:
         """Raise ValueError for wrong shapes, NaN, asymmetric or indefinite P, or l > u."""
@@ -438,11 +438,6 @@ class QP:
                 continue
             if np.any(np.asarray(weight)[m - rows :] != hard):
                 fail(name, "softens the rows of a ball", f"Balls are hard: give {hard} there")
-
-
-def dense(M: Any) -> Any:
-    """Return a matrix of SciPy's sparse kinds as a dense array, any other as it is."""
-    return M.toarray() if hasattr(M, "toarray") else M
 
 
 @named_pytree

@@ -373,7 +373,9 @@ def as_arrays(qp: QP) -> QP:
     """The same program with all fields in one floating type, the widest among them, P made exactly
     symmetric, and bounds of 1e20 and above as infinity."""
     dtype = floating_dtype(qp)
-    qp = jax.tree.map(lambda v: jnp.asarray(v, dtype), qp, is_leaf=lambda v: isinstance(v, list))
+    qp = jax.tree.map(
+        lambda v: jnp.asarray(v, dtype), qp, is_leaf=lambda v: isinstance(v, list | tuple)
+    )
     l = jnp.where(qp.l <= -INFINITE, -jnp.inf, qp.l)
     u = jnp.where(qp.u >= INFINITE, jnp.inf, qp.u)
     return replace(qp, P=symmetric(qp.P), l=l, u=u)
