@@ -191,7 +191,7 @@ def directions(mpc: MPC) -> tuple[np.ndarray, np.ndarray]:
     without such a form."""
     require_generators(mpc.disturbance)
     center, gamma = generators(mpc.disturbance)
-    if np.linalg.matrix_rank(np.asarray(gamma, float)) < gamma.shape[1]:
+    if gamma.size and np.linalg.matrix_rank(np.asarray(gamma, float)) < gamma.shape[1]:
         what = "has generators that depend on each other, to which no policy can answer one by one"
         fail("disturbance", what, 'Give a Box or independent generators, or policy="tightened"')
     return center, gamma

@@ -40,6 +40,7 @@ from jaxmpc.qp.linalg import (
     apply,
     arrays,
     by_step,
+    float64_arrays,
     floating_dtype,
     host_arrays,
     matmul,
@@ -265,7 +266,7 @@ def in_float64(mpc: MPC) -> MPC:
     where it is traced."""
     cure = "Call it outside jit, vmap and grad; inside them take jm.solve, and jax.vmap for a batch"
     require_untraced("mpc", mpc, cure)
-    return jax.tree.map(np.float64, filled_in(mpc))
+    return float64_arrays(filled_in(mpc))
 
 
 def _condense(mpc: MPC) -> Condensed:

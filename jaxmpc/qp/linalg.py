@@ -111,6 +111,11 @@ def host_arrays(tree: T) -> T:
     return jax.tree.map(cast, tree)
 
 
+def float64_arrays(tree: T) -> T:
+    """Leaves as arrays of NumPy in float64."""
+    return jax.tree.map(lambda v: np.asarray(v, np.float64), tree)
+
+
 def on_device(tree: T) -> T:
     """Return arrays of NumPy as arrays of JAX whose memory is their own. (`jnp.array` compiles a
     program for each shape, in JAX 0.12.)"""

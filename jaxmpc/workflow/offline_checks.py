@@ -28,6 +28,7 @@ from jaxmpc.mpc.rows import given_blocks, row_table
 from jaxmpc.mpc.tightening import feedback_gain
 from jaxmpc.pytrees import record
 from jaxmpc.qp.admm import ADMM
+from jaxmpc.qp.linalg import float64_arrays
 from jaxmpc.qp.status import Status
 from jaxmpc.recursion.analysis import examine
 from jaxmpc.recursion.report import RecursionReport
@@ -112,7 +113,7 @@ class SetPoint:
         drift = np.where(np.abs(drift) <= RESTS * size, 0.0, drift)
         found: list[str] = []
         with jax.enable_x64(True):
-            limits = given_blocks(jax.tree.map(np.float64, mpc), float)
+            limits = given_blocks(float64_arrays(mpc), float)
             still: Any = np.tile(x, (mpc.horizon + 1, 1)), np.tile(u, (mpc.horizon, 1))
             values = [np.asarray(b.values(still[0], still[1] * (not b.rate))) for b in limits]
         for b, value in zip(limits, values, strict=True):

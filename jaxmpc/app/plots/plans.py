@@ -15,6 +15,7 @@ from jaxmpc.checks import fail, require_kind
 from jaxmpc.mpc.plan import Plan, checked_aim
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import given_blocks
+from jaxmpc.qp.linalg import float64_arrays
 from jaxmpc.qp.status import Status
 
 # What a value may be beyond its limit, of the limit, before it counts as exceeded.
@@ -84,7 +85,7 @@ def _limits_of_axes(mpc: MPC) -> list[np.ndarray]:
         for shape in ((N + 1, system.n), (N, system.m))
     ]
     with jax.enable_x64(True):
-        rows = given_blocks(jax.tree.map(np.float64, mpc), float)
+        rows = given_blocks(float64_arrays(mpc), float)
     for b in rows:
         low, high = b.at_steps(b.lower, N + 1, -np.inf), b.at_steps(b.upper, N + 1, np.inf)
         for found, M, other in zip(ends, (b.H, b.D), (b.D, b.H), strict=True):
