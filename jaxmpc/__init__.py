@@ -20,7 +20,7 @@ import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from jaxmpc.names import raise_absent
+from jaxmpc.names import imported, raise_absent
 from jaxmpc.version import __version__ as __version__
 
 if TYPE_CHECKING:
@@ -154,8 +154,8 @@ def __getattr__(name: str) -> Any:
         raise_absent(__name__, name)
     home = next((home for home, names in HOMES.items() if name in names.split()), None)
     if home is None:
-        return import_module(f"{__name__}.{name}")
-    globals()[name] = found = getattr(import_module(f"{__name__}.{home}"), name)
+        return imported(f"{__name__}.{name}")
+    globals()[name] = found = getattr(imported(f"{__name__}.{home}"), name)
     return found
 
 

@@ -4,10 +4,21 @@ import ast
 import difflib
 import functools
 import sys
+from importlib import import_module
 from pathlib import Path
+from threading import RLock
+from types import ModuleType
 from typing import NoReturn
 
 ROOT = Path(__file__).parent
+_importing = RLock()
+
+
+def imported(module: str) -> ModuleType:
+    """Import a module of this package when it is first used, in one thread at a time: modules that
+    need each other's would wait for each other in two."""
+    with _importing:
+        return import_module(module)
 
 
 @functools.cache

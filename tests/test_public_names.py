@@ -75,6 +75,23 @@ assert scaled._cache_size() == 1, scaled._cache_size()"""
     assert done.returncode == 0, done.stderr
 
 
+def test_names_are_first_used_in_many_threads_at_once():
+    program = """from concurrent.futures import ThreadPoolExecutor
+from threading import Barrier
+import jaxmpc as jm
+names = [*jm.__all__, "app"]
+together = Barrier(len(names))
+
+def use(name):
+    together.wait()
+    return getattr(jm, name) if name != "app" else jm.app.plots
+
+with ThreadPoolExecutor(len(names)) as pool:
+    assert all(pool.map(use, names))"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
 def test_without_mujoco(monkeypatch, tmp_path):
     """The rest works, and a robot names what to install, in the command too."""
     monkeypatch.setitem(sys.modules, "mujoco", None)
