@@ -299,6 +299,15 @@ def gather_size(chunk: int) -> int:
     return max(chunk // 16, 64)
 
 
+def program_size(count: int) -> int:
+    """Return how many instances a program is compiled for that takes `count` ≥ 1: a power of two
+    from 8 to 1,024, above that a multiple of an eighth of one. So calls with any numbers of states
+    need few programs, which take seconds to compile."""
+    power = 1 << max(count - 1, 7).bit_length()
+    step = power // 16 if power > 1024 else power
+    return -(-count // step) * step
+
+
 def padded(x: np.ndarray, size: int) -> np.ndarray:
     """The first row repeated up to `size` rows."""
     if len(x) == size:

@@ -35,6 +35,7 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.batches import (
+    CHUNK,
     Compiled,
     Devices,
     Part,
@@ -72,9 +73,8 @@ MOST_PROGRAMS, MOST_ENTRIES = 2000, 2 * 10**7
 LEFT = 4096
 # Proofs of up to so many bytes in total stay on the device until they are used.
 ON_DEVICE = 2**31
-# Chunks below this size are filled up to powers of two, of this one at least: compiling takes far
-# longer than what is computed in vain.
-SMALL, FEWEST = 1024, 64
+# Points that a program takes at least: compiling takes far longer than what is computed in vain.
+FEWEST = 64
 # Number of points from which their typical size is taken.
 SAMPLE = 4096
 # Parts that are submitted and not yet joined, at most: enough for some hundred workers.
@@ -362,10 +362,10 @@ class Pipeline:
         self.margins = problem.row_margins(exact, scope.typical)
         programs = min(MOST_PROGRAMS, MOST_ENTRIES // max(problem.rows.U.size, 1))
         self.share = -(-programs // max(scope.parts, 1))
-        # A power of two where it is small, so that maps of a few points more compile nothing; and
+        # A power of two where it is small, so that maps of some points more compile nothing; and
         # as the devices share it.
         few = max(FEWEST, 1 << (chunk - 1).bit_length())
-        self.whole = divisible(few if chunk < SMALL else chunk, self.devices)
+        self.whole = divisible(few if chunk < CHUNK else chunk, self.devices)
         each = gather_size(self.whole // count(self.devices))
         hull = hull_for(problem, scope.points)
         if hull is not None:

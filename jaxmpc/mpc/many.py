@@ -42,6 +42,7 @@ from jaxmpc.batches import (
     over_devices,
     padded,
     placement,
+    program_size,
     side_by_side,
     workers,
 )
@@ -61,8 +62,6 @@ from jaxmpc.qp.status import Status
 
 # States from which on transfer is tried: below, compiling its programs costs more than it saves.
 MANY = 32_768
-# States that a program takes at once where they are few, or follow others.
-BLOCK = 2048
 # Of chunks so many or more, one is tried before all others; where fewer than this fraction of those
 # that can be solved are by following, solving takes less time.
 TRIAL, LEAST = 16, 0.3
@@ -143,8 +142,8 @@ def solve_many(
 class Batch:
     """Plans from the states x (B, p), which lie in NumPy or on the device.
 
-    chunk, block: states that a program takes at once, of many and of few; devices share them.
-    answer: the plans so far, B in front, in NumPy (to_host) or on the device.
+    chunk: states that a program takes at once; devices share them. answer: the plans so far, B in
+    front, in NumPy (to_host) or on the device.
     """
 
     def __init__(
@@ -156,10 +155,9 @@ class Batch:
         # Elsewhere than on a CPU two chunks at once: one is computed while the other is copied.
         self.together = workers() if on_cpu and devices is None else 2
         self._begins: Any = nullcontext() if on_cpu else threading.Lock()
-        shares = workers() if devices is None else 1
-        most = min(count(devices) * default_chunk(numbers_held(controller)), -(-len(x) // shares))
-        self.chunk = divisible(max(min(chunk or most, len(x)), 1), devices)
-        self.block = divisible(min(self.chunk, count(devices) * BLOCK), devices)
+        shares = workers() if devices is None and chunk is None else 1
+        most = chunk or count(devices) * default_chunk(numbers_held(controller))
+        self.chunk = divisible(min(most, program_size(-(-len(x) // shares))), devices)
         self._stores = threading.Lock()
         self.answer: Plan | None = None
 
@@ -170,7 +168,6 @@ class Batch:
         # (On GPUs the solver's kernels take less time than the laws and the host's indices would.)
         on_cpu = default_platform() == "cpu"
         if transfer and self.to_host and on_cpu and B >= MANY and transferable(self.controller):
-            self.block = self.chunk  # one size, whose programs are compiled once
             left = self._transfer()
         self._run(_plans(self.devices), (self.controller,), left)
         assert self.answer is not None
@@ -204,7 +201,7 @@ class Batch:
     def _run(self, program: Compiled, arguments: tuple, index: np.ndarray) -> None:
         """Put the plans of program(*arguments, states) from the states at `index` (k,) into
         `answer`."""
-        size = self.chunk if divisible(len(index), self.devices) >= self.chunk else self.block
+        size = self.chunk
         pieces = [index[i : i + size] for i in range(0, len(index), size)]
 
         def parts(where: np.ndarray) -> list[Plan]:
@@ -216,7 +213,7 @@ class Batch:
             self._put(where, parts(where))
 
         if not self.to_host:
-            self.answer = self._left_there(program, arguments, size)
+            self.answer = self._left_there(program, arguments)
         elif self.answer is None and len(index) == len(self.x) <= size and self.devices is None:
             self.answer = first_rows(parts(index)[0], len(index))
         else:
@@ -241,12 +238,12 @@ class Batch:
         for all_, rows in zip(*map(jax.tree.leaves, (self.answer, found)), strict=True):
             all_[there] = rows[: len(where)]
 
-    def _left_there(self, program: Compiled, arguments: tuple, size: int) -> Plan:
+    def _left_there(self, program: Compiled, arguments: tuple) -> Plan:
         """Return the plans from all states, which lie on the devices: each has its part of the
-        states, in order, and takes `size` over their number at once."""
-        each = size // count(self.devices)
-        whole = divisible(len(self.x), self.devices)
-        x = self.x if len(self.x) == whole else padded(np.asarray(self.x), whole)
+        states, in order, and takes `chunk` over their number at once."""
+        each = self.chunk // count(self.devices)
+        whole = max(divisible(len(self.x), self.devices), self.chunk)
+        x = self._states(np.arange(len(self.x)), whole)
         # The caller's array may change once this has returned.
         x = jax.block_until_ready(jax.device_put(x, placement(self.devices, True), may_alias=False))
         share = whole // count(self.devices)

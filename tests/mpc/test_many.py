@@ -6,6 +6,8 @@ import problems
 import pytest
 
 import jaxmpc as jm
+from jaxmpc.batches import program_size
+from jaxmpc.mpc.many import Batch
 
 pytestmark = pytest.mark.usefixtures("as_of_many")
 
@@ -113,3 +115,18 @@ def test_plans_that_stay_on_the_device_are_those_on_the_host(states):
         there = jm.solve_many(mpc, some, chunk=64, to_host=False)
         assert there.inputs.dtype == np.float64 and isinstance(there.inputs, jax.Array)
         jax.tree.map(np.testing.assert_array_equal, host, there)
+
+
+def test_any_numbers_of_states_need_few_programs():
+    """Compiling one takes seconds, so counts of states are filled up, small ones to at most twice
+    as many and others by at most an eighth."""
+    counts = np.arange(1, 8193)
+    sizes = np.array([program_size(int(count)) for count in counts])
+    assert len(set(sizes)) == 32 and np.all(sizes >= counts)
+    assert np.all(sizes <= np.where(counts < 1024, np.maximum(2 * counts, 8), 1.125 * counts))
+    with jax.enable_x64(True):
+        controller = jm.Controller(problems.joint_o_inf(3))
+    made = lambda count, **given: Batch(controller, np.zeros((count, 2)), **given).chunk
+    on_host = {"chunk": None, "to_host": True, "devices": None}
+    assert len({made(count, **on_host) for count in range(1, 300)}) <= 7
+    assert made(7000, **on_host | {"chunk": 100}) == 100

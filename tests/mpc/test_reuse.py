@@ -18,7 +18,6 @@ pytestmark = [pytest.mark.cpu, pytest.mark.usefixtures("as_of_many")]
 def few(monkeypatch):
     """Transfer among `COUNT` states, in small programs; returns what was run on how many."""
     monkeypatch.setattr(many, "MANY", COUNT)
-    monkeypatch.setattr(many, "BLOCK", 64)
     monkeypatch.setattr(many, "STATES_A_CELL", 16)
     run, log = many.Batch._run, []
 
