@@ -301,10 +301,10 @@ def gather_size(chunk: int) -> int:
 
 def program_size(count: int) -> int:
     """Return how many instances a program is compiled for that takes `count` ≥ 1: a power of two
-    from 8 to 1,024, above that a multiple of an eighth of one. So calls with any numbers of states
+    from 8 to 128, above that a multiple of an eighth of one. So calls with any numbers of states
     need few programs, which take seconds to compile."""
     power = 1 << max(count - 1, 7).bit_length()
-    step = power // 16 if power > 1024 else power
+    step = power // 16 if power > 128 else power
     return -(-count // step) * step
 
 
