@@ -225,6 +225,7 @@ def dense_jacobian(mpc, x0):
     return np.linalg.solve(K, -np.vstack([F, D[active]]))[:N, None]
 
 
+@pytest.mark.slow
 def test_derivative_in_float32():
     """Against that of the conditions of optimality in float64, where an input costs 10⁻⁴ and active
     rows are nearly parallel: by a Riccati recursion in float32 alone it was off by 0.3."""
