@@ -273,6 +273,9 @@ def parse_options(kind: Any, prog: str, words: Sequence[str]) -> tuple[Everywher
         what = "no such option" if rest[0].startswith("-") else "belongs to no option"
         switches = [f"--no-{field.name}" for field in fields(kind) if field.default is True]
         meant = nearest(rest[0].partition("=")[0], [*known, *switches, "--help"])
+        if rest[0].endswith(".toml"):
+            option = "--config" if "--config" in known else "--output"
+            meant = f"Write {option} {rest[0]}. "
         fail(rest[0], what, f"{meant}See {prog} --help")
     common, options = (
         part(**{field.name: getattr(found, field.name) for field in fields(part)})

@@ -282,6 +282,8 @@ LINES = [
     ("sweep --no-resume", "--no-resume: no such option"),
     ("sweep -x", "-x: no such option"),
     ("sweep 5", "5: belongs to no option"),
+    ("sweep a.toml", "a.toml: belongs to no option. Write --config a.toml."),
+    ("init a.toml", "a.toml: belongs to no option. Write --output a.toml."),
     ("sweep --overwrite yes", "yes: belongs to no option"),
     ("sweep --refine 3", "3: belongs to no option"),
     ("sweep --horizon 3 4", "4: belongs to no option"),
