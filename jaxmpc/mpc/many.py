@@ -86,7 +86,8 @@ def solve_many(
     to_host: bool = True,
     devices: int | Sequence[jax.Device] | None = None,
 ) -> Plan:
-    """Solve the MPC problem from each state x0s (B, n); the Plan holds host arrays, B in front.
+    """Solve the MPC problem from each state x0s (B, n); the Plan holds host arrays, B in front,
+    some of which cannot be written into.
 
     Where input rates are limited or weighted x0s may be (B, n + m), with the previous inputs in the
     last columns; (B, n) takes them as zero. The plans track the origin.
@@ -157,7 +158,10 @@ class Batch:
         self._begins: Any = nullcontext() if on_cpu else threading.Lock()
         shares = workers() if devices is None and chunk is None else 1
         most = chunk or count(devices) * default_chunk(numbers_held(controller))
-        self.chunk = divisible(min(most, program_size(-(-len(x) // shares))), devices)
+        size = -(-len(x) // shares)
+        # (Cutting plans that lie on several devices would move them between these.)
+        size = program_size(size) if to_host or devices is None else size
+        self.chunk = divisible(min(most, size), devices)
         self._stores = threading.Lock()
         self.answer: Plan | None = None
 
