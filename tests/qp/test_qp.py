@@ -625,15 +625,14 @@ def badly_scaled(n, rng):
 class TestHardPrograms:
     """Each of these once ended at the iteration limit."""
 
-    @pytest.mark.parametrize("bound", [1e5, 1e12, 1e20, 1e30])
-    @pytest.mark.slow
+    @pytest.mark.parametrize("bound", [1e5, 1e10, 1e12, 1e15, 1e20, 1e30])
     def test_linear_program_with_far_bounds(self, x64, bound):
         """max x + 2y, x + y ≤ 1, x and y from 0 to far away: (0, 1)."""
         qp = jm.QP(
             np.zeros((2, 2)), np.array([-1.0, -2.0]), np.vstack([np.ones(2), np.eye(2)]),
             np.array([-bound, 0.0, 0.0]), np.array([1.0, bound, bound]),
         )  # fmt: skip
-        found = jm.solve_qp(qp)
+        found = solution(qp, 1e-8)
         assert found.status == jm.Status.SOLVED
         np.testing.assert_allclose(found.z, [0.0, 1.0], atol=1e-8)
 
