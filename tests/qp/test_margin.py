@@ -97,12 +97,13 @@ def test_random_rows_against_another_solver():
 
 @pytest.mark.slow
 def test_gradient_against_differences():
-    """Both signs: at a state inside the joint's feasible set and at one outside."""
+    """Both signs: at a state inside the joint's feasible set and at one outside. The margin is
+    piecewise affine: long steps keep the rounding of its values out of the differences."""
     condensed = jm.Controller(problems.joint()).condensed
     f = jax.jit(lambda x: jm.qp.feasibility_margin(condensed.qp(x))[0])
     gradient = jax.jit(jax.grad(f))
     for x in (np.array([0.3, 1.2]), np.array([1.4, 1.7]), np.array([-1.9, -2.5])):
-        numeric = [(f(x + h) - f(x - h)) / 2e-5 for h in 1e-5 * np.eye(2)]
+        numeric = [(f(x + h) - f(x - h)) / 2e-4 for h in 1e-4 * np.eye(2)]
         np.testing.assert_allclose(gradient(x), numeric, atol=1e-6)
 
 
