@@ -67,7 +67,7 @@ def _of_another_library(value: Any) -> bool:
 
 def numpy_array(value: Any) -> np.ndarray:
     """Return numbers as an array of NumPy of a type that JAX has."""
-    array: np.ndarray = of_known_type(np.asarray(value))
+    array: np.ndarray = of_known_type(np.asarray(of_known_type(value)))
     return array
 
 

@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxmpc.arrays import host_array
 from jaxmpc.checks import fail, require_finite, require_symmetric_psd
 from jaxmpc.pytrees import record
 
@@ -51,8 +52,8 @@ class Parameter:
     def __post_init__(self) -> None:
         if self.domain not in DOMAINS:
             fail("domain", f"{self.domain!r}", f"Give one of {', '.join(DOMAINS)}")
-        require_finite("value", self.value)
-        value = np.asarray(self.value, np.float64)
+        value = host_array("value", self.value)
+        require_finite("value", value)
         if self.domain in ("diagonal", "definite"):
             if self.domain == "diagonal" and value.ndim == 1:
                 value = np.diag(value)
