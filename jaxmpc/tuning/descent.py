@@ -20,6 +20,7 @@ from jaxmpc.batches import chosen_devices
 from jaxmpc.checks import fail, whole
 from jaxmpc.files import fingerprint, read_arrays, remove_partial, write_arrays
 from jaxmpc.pytrees import record
+from jaxmpc.qp.linalg import float64_arrays
 
 # (loss, numbers to record) and (loss, gradient, numbers to record).
 Validate = Callable[[Any], tuple[float, Mapping[str, float]]]
@@ -196,7 +197,7 @@ def descend(
     settings.validate()
     updates = settings.updates
     optimizer = optimizer if settings.optimizer is None else settings.optimizer
-    theta = jax.tree.map(lambda v: np.asarray(v, np.float64), theta)
+    theta = float64_arrays(theta)
     path = None if settings.checkpoint is None else Path(settings.checkpoint)
     state = State(theta, None, thetas=[theta])
     mark = fingerprint(decides, theta)
@@ -263,7 +264,7 @@ def _require_first_order(optimizer: optax.GradientTransformation, theta: Any) ->
 def _step(state: State, gradient: Gradient, optimizer: optax.GradientTransformation) -> None:
     """Take a step; where the gradient is not finite undo the last step and take half of it."""
     loss, slope, numbers = gradient(state.theta, len(state.rows))
-    slope = jax.tree.map(lambda v: np.asarray(v, np.float64), slope)
+    slope = float64_arrays(slope)
     norm = float(np.sqrt(sum(np.sum(v**2) for v in jax.tree.leaves(slope))))
     accepted = bool(np.isfinite(loss) and np.isfinite(norm))
     row = {"loss": float(loss), "gradient_norm": norm, "accepted": accepted}

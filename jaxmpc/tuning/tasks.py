@@ -25,6 +25,7 @@ from jaxmpc.mpc.condense import Inequalities, prestabilising_gain
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.problem import MPC, soften
 from jaxmpc.qp.admm import ADMM
+from jaxmpc.qp.linalg import float64_arrays
 from jaxmpc.qp.status import Status
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.robot import Robot
@@ -121,7 +122,7 @@ class WeightTask:
         outcome = evaluate_runs(run, self.plant, goal, tolerance=tolerance)
         kept = outcome.kept
         if isinstance(self.limits, Polytope):
-            limits = jax.tree.map(lambda v: np.asarray(v, float), self.limits)
+            limits = float64_arrays(self.limits)
             kept = kept & rows_kept(limits, outcome.coordinates).all(axis=(1, 2))
         status = np.asarray(run.status)
         return {
