@@ -109,12 +109,11 @@ def run(text, kernel, args, batch):
     space = {"triton": SimpleNamespace(jit=lambda function: function)}
     exec(compile(text[len(head) :], "<kernel>", "exec"), space)  # noqa: S102
     inputs = [np.array(v).reshape(-1) for v in args]
-    shared = {output: inputs[given] for given, output in kernel.aliases}
     outputs = []
-    for k, ref in enumerate(kernel.outputs):
+    for ref in kernel.outputs:
         size = math.prod((*batch, *ref.shape))
         unset = np.nan if ref.dtype.kind == "f" else np.iinfo(ref.dtype).min
-        outputs.append(shared.get(k, np.full(size, unset, ref.dtype)))
+        outputs.append(np.full(size, unset, ref.dtype))
     for number in range(math.prod(batch) * kernel.own):
         space["tl"] = language(number)
         space[kernel.name](*map(Pointer, [*inputs, *outputs]))

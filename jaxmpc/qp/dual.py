@@ -463,9 +463,8 @@ def _search(dual: Dual, rows: int, side: int, steps: MostSteps, *, last: bool) -
         limit_ref, cold_ref, flags_in, S_ref, y_in, v_in, *others = refs
         *bound_refs, y_ref, v_ref, flags_ref, order_ref, change_ref, moved_ref = others
         i, k, few = indices(width), indices(side), indices(ROWS)
-        # An instance that is done leaves what it shares with the results as it is, unread.
-        busy = flags_in[1] > 0
-        here, limit = (i < m) & busy, limit_ref[0]
+        # An instance that is done reads no more than what it returns.
+        here, limit = (i < m) & (flags_in[1] > 0), limit_ref[0]
         rows_of = zip(bound_refs, FREE, strict=False)
         own = Bounds.of_rows(load(ref.at[i], here, free) for ref, free in rows_of)
 
@@ -514,20 +513,20 @@ def _search(dual: Dual, rows: int, side: int, steps: MostSteps, *, last: bool) -
             flags = (flag.astype(jnp.int32) for flag in (go_on | stays, optimal, stays))
             return SearchState(y, v, taken, *flags)
 
-        y, v = load(y_in.at[i], here), load(v_in.at[i], here)
+        y, v = load(y_in.at[i], i < m), load(v_in.at[i], i < m)
         begin = SearchState(y, v, flags_in[0], flags_in[1], flags_in[2], jnp.int32(0))
         end = jax.lax.while_loop(lambda s: (s.open > 0) & (s.stays == 0), step, begin)
-        store(y_ref.at[i], end.y, here)
-        store(v_ref.at[i], end.v, here)
+        store(y_ref.at[i], end.y, i < m)
+        store(v_ref.at[i], end.v, i < m)
         four = indices(4)
         flags = jnp.where(four == 0, end.taken, jnp.where(four == 1, end.open, end.optimal))
-        store(flags_ref.at[four], flags, (four < 3) & busy)
+        store(flags_ref.at[four], flags, four < 3)
 
     vectors = [(m, dtype), (m, dtype), (3, jnp.int32)]
     scratch = [(side, jnp.int32), (side, dtype), (m, dtype)]
     shapes = [jax.ShapeDtypeStruct((count,), kind) for count, kind in vectors + scratch]
     warps = 1 if width <= 64 and side <= LEAST else 2 if side <= 32 and width <= 128 else 4
-    program = call(dual_steps, shapes, warps, aliases={2: 2, 4: 0, 5: 1})
+    program = call(dual_steps, shapes, warps)
 
     def run(limit: Array, cold: Array, flags: Array, y: Array, v: Array) -> tuple[Array, ...]:
         return tuple(program(limit[None], cold, flags, S, y, v, *bounds.columns)[:3])

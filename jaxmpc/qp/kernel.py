@@ -87,7 +87,7 @@ class Kernel:
     """A traced kernel.
 
     jaxpr: of no argument and no result. inputs, outputs: the memory of each. own: places of its own
-    grid. aliases: (input, output) pairs that share their memory.
+    grid.
     """
 
     name: str
@@ -96,7 +96,6 @@ class Kernel:
     outputs: list[Ref]
     own: int
     warps: int
-    aliases: tuple[tuple[int, int], ...]
 
 
 class _Trace(threading.local):
@@ -109,17 +108,11 @@ class _Trace(threading.local):
 _trace = _Trace()
 
 
-def call(
-    kernel: Callable,
-    shapes: Any,
-    warps: int = 1,
-    grid: int = 1,
-    aliases: dict[int, int] | None = None,
-) -> Callable:
+def call(kernel: Callable, shapes: Any, warps: int = 1, grid: int = 1) -> Callable:
     """Return the kernel as a function of arrays, with one program for each place of the grid.
     `vmap` makes it one of a batch of them.
 
-    shapes: those of the results. aliases: arguments whose memory a result takes over.
+    shapes: those of the results.
     """
     out, tree = jax.tree.flatten(shapes)
 
@@ -132,8 +125,7 @@ def call(
         finally:
             _trace.held = None
         inputs, outputs = refs[: len(args)], refs[len(args) :]
-        pairs = tuple((aliases or {}).items())
-        traced = Kernel(kernel.__name__, jaxpr, inputs, outputs, grid, warps, pairs)
+        traced = Kernel(kernel.__name__, jaxpr, inputs, outputs, grid, warps)
         batched = ((),) * len(args)
         return jax.tree.unflatten(
             tree, kernel_p.bind(*args, kernel=traced, batched=batched, batch=())
@@ -275,8 +267,6 @@ def _batched_kernel(
         has = axis is not None
         if has:
             given[k] = jnp.moveaxis(given[k], axis, 0)
-        elif k in dict(kernel.aliases):  # a result of each instance takes its memory
-            given[k], has = jnp.broadcast_to(given[k], (size, *given[k].shape)), True
         flags.append((has, *batched[k]))
     out = kernel_p.bind(*given, kernel=kernel, batched=tuple(flags), batch=(size, *batch))
     return out, [0] * len(out)
@@ -305,7 +295,6 @@ def _lowered_by_triton(*args: Array, kernel: Kernel, batched: tuple, batch: tupl
             name=kernel.name,
             num_warps=kernel.warps,
             num_stages=1,
-            input_output_aliases=dict(kernel.aliases),
             **{"out_type" if "out_type" in names else "out_shape": shapes},
             **({"backend_options": fused} if "backend_options" in names else fused),
         )
@@ -352,10 +341,9 @@ class _Memory(NamedTuple):
 def _in_turn(kernel: Kernel, *args: Array) -> list[Array]:
     """Return the results of one instance, by its programs in turn."""
     arrays = [v.reshape(-1) for v in args]
-    taken = {output: arrays[given] for given, output in kernel.aliases}
-    for k, ref in enumerate(kernel.outputs):
+    for ref in kernel.outputs:
         unset = np.nan if ref.dtype.kind == "f" else np.iinfo(ref.dtype).min
-        arrays.append(taken.get(k, jnp.full(math.prod(ref.shape), unset, ref.dtype)))
+        arrays.append(jnp.full(math.prod(ref.shape), unset, ref.dtype))
 
     def advance(place: Array, arrays: tuple[Array, ...]) -> tuple[Array, ...]:
         return _evaluate(kernel.jaxpr, [], _Memory(place, arrays))[0].arrays
@@ -399,7 +387,6 @@ def _by_pallas(kernel: Kernel, *args: Array) -> list[Array]:
         grid=(kernel.own,) if kernel.own > 1 else (),
         name=kernel.name,
         compiler_params=triton.CompilerParams(num_warps=kernel.warps, num_stages=1),
-        input_output_aliases=dict(kernel.aliases),
     )(*(v.reshape(-1) for v in args))
     return [v.reshape(ref.shape) for v, ref in zip(found, kernel.outputs, strict=True)]
 

@@ -396,8 +396,7 @@ def lowered(function, states, monkeypatch, compiler=None):
     found = []
 
     def triton_call(
-        *args, kernel, grid, name, num_warps, num_stages, input_output_aliases, out_shape=None,
-        enable_fp_fusion=None,
+        *args, kernel, grid, name, num_warps, num_stages, out_shape=None, enable_fp_fusion=None
     ):  # fmt: skip
         assert enable_fp_fusion is True  # from Triton 3.10 on not by default
         if compiler is not None:
@@ -462,6 +461,22 @@ def test_triton_compiles_the_kernels(architecture, x64, monkeypatch):
     plan = jax.vmap(jm.Controller(joint(), SOLVER).plan)
     gradient = jax.grad(lambda x: jnp.sum(plan(x).cost))
     assert lowered(gradient, jnp.asarray(STATES), monkeypatch, compiler)
+
+
+@pytest.mark.slow
+def test_jax_triton_takes_the_kernels(x64, monkeypatch):
+    """The one that is installed, told that the GPU is an H100. None is needed, but JAX's plugin."""
+    pytest.importorskip("jax_triton")
+    pytest.importorskip("jax_cuda13_plugin")
+    from jaxlib import gpu_triton
+
+    monkeypatch.setattr(gpu_triton, "get_compute_capability", lambda device: 90)
+    for module in (jax_transformations, kernel, derivative):
+        monkeypatch.setattr(module, "on_gpu", lambda: True)
+    plan = jax.vmap(jm.Controller(joint(), SOLVER).plan)
+    traced = jax.jit(jax.grad(lambda x: jnp.sum(plan(x).cost))).trace(jnp.asarray(STATES))
+    text = traced.lower(lowering_platforms=("cuda",)).as_text()
+    assert text.count("triton_kernel_call") >= 14  # as in test_kernels_can_be_lowered_for_a_gpu
 
 
 @pytest.mark.filterwarnings("ignore:The Pallas Triton backend:DeprecationWarning")
