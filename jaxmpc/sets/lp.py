@@ -13,7 +13,7 @@ A number counts as zero if it is within the rounding of the terms that it is the
 import threading
 from collections.abc import Sequence
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import highspy
 import numpy as np
@@ -23,7 +23,7 @@ from jaxmpc.checks import fail
 # Options of HiGHS: tolerances in rows and columns that are scaled to about 1. Its presolve calls
 # some unbounded programs infeasible and needs scaling of its own, so it is off. Entries below 1e-9
 # count as zeros unless told otherwise; 1e-12 is the least that it takes.
-HIGHS = {
+HIGHS: dict[str, Any] = {
     "output_flag": False,
     "presolve": "off",
     "primal_feasibility_tolerance": 1e-10,
@@ -222,7 +222,10 @@ class Program:
             if found is None:
                 continue
             r = np.where(np.abs(found[0]) < 1e-12, 0.0, found[0])
-            off, size = self.M @ r, np.abs(self.M) @ np.abs(r)
+            # Rows of about 1 that let a point go 1e12 times as far as it typically does are no
+            # limits; HiGHS takes their entries for zeros.
+            M = np.where(np.abs(self.M) < HIGHS["small_matrix_value"], 0.0, self.M)
+            off, size = M @ r, np.abs(M) @ np.abs(r)
             off = np.where(self.equal, np.abs(off), off)
             if cost @ r > FLAT * np.abs(cost) @ np.abs(r) and np.all(off <= ROUNDING * size):
                 return r * self.column

@@ -86,3 +86,16 @@ def test_variables_within_bounds_of_their_own_count_in_these_units():
     _, column = scaling(G, g)
     assert (column[2:] <= 2).all()
     assert Program(G, g).margin()[1] > 0.1
+
+
+@pytest.mark.parametrize("spread", [0, 4])
+def test_a_set_is_unbounded_where_only_rounding_closes_it(spread):
+    """Rows computed elsewhere: x₀ ≥ −1.25 and |x₁| ≤ 1, with rounding in place of a zero."""
+    rng = np.random.default_rng(spread)
+    G = np.array([[-0.8, 0.0], [1.4e-18, 1.0], [-2.8e-18, -1.0], [-0.8, 0.0], [1.4e-18, 2.0]])
+    g = np.array([1.0, 1.0, 1.0, 2.0, 3.0])
+    row, unit = 10 ** rng.uniform(-spread, spread, 5), 10 ** rng.uniform(-spread, spread, 2)
+    program = Program(row[:, None] * G * unit, row * g)
+    low, high = program.bounds()
+    assert high[0] == np.inf
+    np.testing.assert_allclose([low[0], low[1], high[1]] * unit[[0, 1, 1]], [-1.25, -1, 1])
