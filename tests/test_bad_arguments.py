@@ -215,12 +215,12 @@ CALLS = [
     ("R: shape () where (1, 1) is needed.", lambda: mpc(R=True).validate()),
     ("R: None where real numbers are", lambda: mpc(R=None).validate()),
     ("R: shape (2,) where (1, 1) is", lambda: mpc(R=[1, 2]).validate()),
-    ("horizon: 0. Give a whole number of steps,", lambda: mpc(horizon=0).validate()),
-    ("horizon: 2.5. Give a whole number of", lambda: mpc(horizon=2.5).validate()),
-    ("horizon: True. Give a whole number of", lambda: mpc(horizon=True).validate()),
-    ("horizon: '3'. Give a whole number of", lambda: mpc(horizon="3").validate()),
-    ("horizon: None. Give a whole number of", lambda: mpc(horizon=None).validate()),
-    ("horizon: [3]. Give a whole number of", lambda: mpc(horizon=[3]).validate()),
+    ("horizon: 0. Give a whole number of steps,", lambda: mpc(horizon=0)),
+    ("horizon: 2.5. Give a whole number of", lambda: mpc(horizon=2.5)),
+    ("horizon: True. Give a whole number of", lambda: mpc(horizon=True)),
+    ("horizon: '3'. Give a whole number of", lambda: mpc(horizon="3")),
+    ("horizon: None. Give a whole number of", lambda: mpc(horizon=None)),
+    ("horizon: [3]. Give a whole number of", lambda: mpc(horizon=[3])),
     ("horizon: needs ", lambda: jm.solve(mpc(horizon=10**6), x)),
     ("horizon: needs ", lambda: jm.solve(mpc(horizon=10**30), x)),
     ("horizon: needs ", lambda: jm.map_feasible_set(mpc(horizon=10**6), np.zeros((1, 2)))),
@@ -719,6 +719,9 @@ def test_wrong_arguments_of_a_controller_are_named():
         with pytest.raises(ValueError) as caught:
             controller(given)
         assert str(caught.value).startswith(message)
+    for feedback in (controller, jm.closed_loop.LinearFeedback(M, np.zeros((1, 2)))):
+        with pytest.raises(ValueError, match="^before: is a ndarray. .* reference has its name"):
+            feedback(x, np.zeros(2))
     for wrong in ("x", x + 1j, np.zeros(3)):
         with pytest.raises(ValueError, match="^x0: "):
             jm.simulate(controller, S, wrong, 3)
@@ -909,6 +912,14 @@ def test_what_jax_cannot_trace_says_so(name, tmp_path, monkeypatch):
 
     with pytest.raises(ValueError, match=r"^(mpc|controller|A): is traced by JAX, .* outside jit"):
         jax.eval_shape(traced, A)
+
+
+@pytest.mark.parametrize(
+    ("transform", "start"), [(jax.jit, 3), (jax.vmap, np.array([3])), (jax.grad, 3.0)]
+)
+def test_a_traced_horizon_says_what_to_give(transform, start):
+    with pytest.raises(ValueError, match="horizon: is traced by JAX. It is static: give a Python"):
+        transform(lambda N: mpc(horizon=N).Q[0, 0])(start)
 
 
 @pytest.mark.parametrize(

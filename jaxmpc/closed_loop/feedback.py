@@ -8,7 +8,7 @@ from jax import Array
 from jaxmpc.arrays import Reals
 from jaxmpc.checks import fail, require_finite, require_shape
 from jaxmpc.mpc.controller import zeros_of
-from jaxmpc.mpc.plan import Control, limited
+from jaxmpc.mpc.plan import Control, limited, require_before
 from jaxmpc.mpc.problem import MPC, at_stage
 from jaxmpc.pytrees import named_pytree, pytree
 from jaxmpc.qp.linalg import floating_dtype, matmul
@@ -153,6 +153,7 @@ class LinearFeedback:
     ) -> Control[NoPlan]:
         """Return the input (m,) at the state x, without plan and memory."""
         self.validate()
+        require_before(before)
         x = one_state(self, x)
         r, s = (0 if v is None else first_row(v, x.dtype) for v in (reference, input_reference))
         u = s + matmul(jnp.asarray(self.K, x.dtype), self.coordinates(x) - r)

@@ -14,7 +14,7 @@ from jaxmpc.checks import fail, number, require_kind, require_shape, require_sym
 from jaxmpc.closed_loop.feedback import one_state
 from jaxmpc.closed_loop.robot_controller import FORCES
 from jaxmpc.mpc.controller import zeros_of
-from jaxmpc.mpc.plan import Control, Plan, WarmStart, applied
+from jaxmpc.mpc.plan import Control, Plan, WarmStart, applied, require_before
 from jaxmpc.mpc.problem import MPC, Soft, as_tuple, soften
 from jaxmpc.mpc.rows import layout
 from jaxmpc.mpc.stagewise.solve import solve_stagewise
@@ -175,6 +175,7 @@ class GaitController:
     ) -> Control[Plan]:
         """Return the input (m,) at the state x, its plan, in ξ, and what to remember."""
         x = one_state(self, x)
+        require_before(before)
         memory: Any = None if before is None else before.memory
         time = jnp.int32(0) if memory is None else memory.time
         problem = self.problem(time)

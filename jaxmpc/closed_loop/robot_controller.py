@@ -16,7 +16,15 @@ from jaxmpc.arrays import Reals, as_weight
 from jaxmpc.checks import concrete, fail, whole
 from jaxmpc.closed_loop.feedback import first_row, one_state
 from jaxmpc.mpc.controller import Controller, zeros_of
-from jaxmpc.mpc.plan import Control, Plan, WarmStart, anchored, applied, limited
+from jaxmpc.mpc.plan import (
+    Control,
+    Plan,
+    WarmStart,
+    anchored,
+    applied,
+    limited,
+    require_before,
+)
 from jaxmpc.mpc.problem import MPC, Outputs, Soft, as_tuple, soften
 from jaxmpc.mpc.rows import layout
 from jaxmpc.mpc.stagewise.nonlinear import NonlinearMPC, Task, task_layout
@@ -361,6 +369,7 @@ class RobotController:
         forecast: as in `solve`, in ξ, with linearize="set-point" only.
         """
         x = one_state(self, x)
+        require_before(before)
         if self.fixed is not None:
             known = {"input_reference": input_reference, "previous_input": previous_input}
             known["forecast"] = forecast

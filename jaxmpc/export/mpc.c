@@ -26,10 +26,16 @@ typedef NAME_real real;
 
 #include "NAME_tables.h"
 
+#ifdef __cplusplus
+#define RESTRICT
+#else
+#define RESTRICT restrict
+#endif
+
 /* out (rows) = A (rows, columns) v, plus out where add is 1. Columns of A lie one after another, so
  * that compilers vectorise the inner loop without reordering a sum. */
-static void product(int rows, int columns, const real *restrict A, const real *restrict v, int add,
-                    real *restrict out) {
+static void product(int rows, int columns, const real *RESTRICT A, const real *RESTRICT v, int add,
+                    real *RESTRICT out) {
   for (int i = 0; i < rows && !add; i++) out[i] = 0;
   for (int j = 0; j < columns; j++)
     for (int i = 0; i < rows; i++) out[i] += A[j * rows + i] * v[j];
@@ -83,14 +89,22 @@ static real clipped(int i, real u) {
 
 void NAME_reset(NAME_memory *memory) { memset(memory, 0, sizeof *memory); }
 
+static int said(int status, real primal, real dual, NAME_info *info) {
+  if (info) {
+    info->status = status;
+    info->primal_residual = primal;
+    info->dual_residual = dual;
+  }
+  return status;
+}
+
 /* Where there is no plan: the last input if its rate counts, else zero, within the limits; the next
  * call begins cold. */
 static int failed(int status, NAME_memory *memory, real *input, NAME_info *info) {
   for (int i = 0; i < MU; i++) input[i] = clipped(i, NP > N ? memory->u[i] : 0);
   NAME_reset(memory);
   memcpy(memory->u, input, sizeof memory->u);
-  if (info) *info = (NAME_info){status, (real)INFINITY, (real)INFINITY};
-  return status;
+  return said(status, (real)INFINITY, (real)INFINITY, info);
 }
 
 /* out = E C z, scaled rows */
@@ -262,7 +276,6 @@ int NAME_step(NAME_memory *memory, const real x[N], const real *state_reference,
   if (!(all_finite(NZ, z) && all_finite(M, y) && all_finite(MU, input) && isfinite(primal) &&
         isfinite(dual)))
     return failed(NAME_OVERFLOW, memory, input, info);
-  if (info) *info = (NAME_info){status, primal, dual};
   memcpy(memory->y, y, M * sizeof(real));
   memcpy(memory->z, z, sizeof z);
   memcpy(memory->theta, theta, sizeof theta);
@@ -274,5 +287,5 @@ int NAME_step(NAME_memory *memory, const real x[N], const real *state_reference,
     memory->u[i] = input[i] = clipped(i, input[i]);
   }
   memory->warm = 1;
-  return status;
+  return said(status, primal, dual, info);
 }

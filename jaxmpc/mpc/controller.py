@@ -47,6 +47,7 @@ from jaxmpc.mpc.plan import (
     applied,
     checked_aim,
     limited,
+    require_before,
     require_warm_start,
     sorted_multipliers,
     within_limits,
@@ -177,6 +178,7 @@ class Controller:
         forecast as in `solve`; previous_input None: the input of `before`.
         """
         aim = self._checked(x, reference, input_reference, previous_input, forecast)
+        require_before(before)
         last = None if before is None else (before.u, before.memory)
         return self._in_two_parts(_control, aim, last, status=lambda found: found.plan.status)
 

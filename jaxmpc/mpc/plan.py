@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.arrays import Reals, as_array, host_array
-from jaxmpc.checks import fail
+from jaxmpc.checks import fail, require_kind
 from jaxmpc.mpc.problem import MPC, at_stage, weights_of
 from jaxmpc.mpc.rows import Block, Layout, blocks, given_blocks, layout, row_count, row_table, split
 from jaxmpc.pytrees import named_pytree, pytree
@@ -245,6 +245,13 @@ class Control(NamedTuple, Generic[Planned]):
     u: Array
     plan: Planned
     memory: Any
+
+
+def require_before(before: Any) -> None:
+    """Raise ValueError unless `before` is what a controller returned, or None."""
+    cure = "Give what the last call returned, or None; a reference has its name: reference=..."
+    if before is not None:
+        require_kind("before", before, Control, cure=cure)
 
 
 def anchored(start: WarmStart, x0: Array) -> WarmStart:

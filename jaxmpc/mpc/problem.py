@@ -257,6 +257,14 @@ class MPC:
     gain: Any = None
 
     def __post_init__(self) -> None:
+        N = self.horizon
+        if not concrete(N):
+            cure = (
+                "It is static: give a Python int; jm.mpc.stack_horizons makes a batch of horizons"
+            )
+            fail("horizon", "is traced by JAX", cure)
+        if not isinstance(N, int | np.integer) or isinstance(N, bool) or N < 1:
+            fail("horizon", f"{N!r}", "Give a whole number of steps, at least 1")
         weights = ("Q", "R", "terminal_cost", "input_rate_weight", "stage_weights")
         store_floats(self, *weights, "prestabilise", "input_rate_limit")
         store_floats(self, "disturbance_matrix", "gain")
@@ -413,11 +421,8 @@ class MPC:
         self.require_unique_inputs(first=1)
 
     def require_sizes(self) -> None:
-        """Raise ValueError where system or horizon are wrong, which give all else its shape."""
+        """Raise ValueError where the system is wrong, which gives all else its shape."""
         require_kind("system", self.system, LinearSystem)
-        whole = isinstance(self.horizon, int | np.integer) and not isinstance(self.horizon, bool)
-        if not whole or self.horizon < 1:
-            fail("horizon", f"{self.horizon!r}", "Give a whole number of steps, at least 1")
         self.system.validate(self.horizon)
 
     @property

@@ -9,7 +9,6 @@ positive definite, and so on. The derivative of a plan is that of the solution o
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import reduce
-from operator import attrgetter
 from typing import Any
 
 import jax.numpy as jnp
@@ -118,6 +117,7 @@ class MPCLayer:
 
     def problem(self, theta: Mapping[str, Any]) -> MPC:
         """Return the problem at θ, for any function that takes one. Works inside jit and grad."""
+        require_kind("theta", theta, Mapping, cure="Give a dict of arrays, as from init()")
         if set(theta) != set(self.parameters):
             given, needed = ", ".join(theta), ", ".join(self.parameters)
             fail("theta", f"has the names {given or 'none'}", f"Needed: {needed}, as from init()")
@@ -164,11 +164,16 @@ def _path(name: str) -> list[str]:
 
 def _at(mpc: MPC, name: str) -> np.ndarray:
     """Return what lies at a name in the problem; ValueError where there is nothing."""
+    known = 'such as "Q", "R", "P", "A", "B", "c", "inputs.upper"'
+    *parts, last = _path(name)
     try:
-        value = attrgetter(".".join(_path(name)))(mpc)
+        part = reduce(getattr, parts, mpc)
+        value = getattr(part, last)
     except AttributeError:
-        known = 'such as "Q", "R", "P", "A", "B", "c", "inputs.upper"'
         fail("learn", f"{name!r} is no field of the problem", f"Give names {known}")
+    field = getattr(part, "__dataclass_fields__", {}).get(last)
+    if field is not None and field.metadata.get("static"):
+        fail("learn", f"{name!r} is a constant of the problem", f"Give names {known}")
     if value is None:
         fail("learn", f"{name!r} is None in the problem", "Give it a value to start from")
     if not isinstance(value, float | int | np.ndarray | Array):

@@ -13,7 +13,8 @@ import pytest
 import jaxmpc as jm
 from jaxmpc.export import export_explicit_c
 
-CC = shutil.which("cc")
+CC, CXX = map(shutil.which, ("cc", "c++"))
+AS_CPP = "-x c++ -std=c++11 -Wall -Wextra -Wpedantic -Werror -fsyntax-only".split()
 compiled = pytest.mark.skipif(CC is None, reason="there is no C compiler")
 
 
@@ -23,6 +24,8 @@ def built(regions, folder, dtype="float64", **options):
     strict = "-std=c99 -O2 -Wall -Wextra -Wpedantic -Werror -shared -fPIC".split()
     library = folder / f"{dtype}.so"
     subprocess.run([CC, *strict, folder / "law.c", "-lm", "-o", library], check=True)
+    if CXX is not None:
+        subprocess.run([CXX, *AS_CPP, folder / "law.c"], check=True)
     call, m = ctypes.CDLL(str(library)).law_evaluate, regions.mpc.system.m
 
     def law(x):

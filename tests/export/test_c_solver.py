@@ -16,7 +16,8 @@ from jaxmpc.closed_loop import Disturbance, KalmanFilter, OffsetFreeController, 
 from jaxmpc.export import check_fixed_steps, choose_steps, export_c
 from jaxmpc.export.c_solver import ClosedLoopCheck
 
-CC = shutil.which("cc")
+CC, CXX = map(shutil.which, ("cc", "c++"))
+AS_CPP = "-x c++ -std=c++11 -Wall -Wextra -Wpedantic -Werror -fsyntax-only".split()
 compiled = pytest.mark.skipif(CC is None, reason="there is no C compiler")
 STEPS = jm.ADMM(iterations=12, newton_steps=0)
 
@@ -100,6 +101,8 @@ class Compiled:
         strict = "-std=c99 -O2 -Wall -Wextra -Wpedantic -Werror -shared -fPIC".split()
         library = folder / f"{name}.so"
         subprocess.run([CC, *strict, folder / f"{name}.c", "-lm", "-o", library], check=True)
+        if CXX is not None:
+            subprocess.run([CXX, *AS_CPP, folder / f"{name}.c"], check=True)
         self.call = getattr(ctypes.CDLL(str(library)), f"{name}_step")
         self.memory = np.zeros(10_000)  # as NAME_reset leaves it
 

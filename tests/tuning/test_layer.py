@@ -193,6 +193,8 @@ def test_a_closed_loop_carries_its_plans(layer, lesson, start, x64):
         ("q", "'q' is no field"),
         ("c", "'c' is None in the problem"),
         ("states", "'states' is a Box in the problem"),
+        ("horizon", "'horizon' is a constant of the problem"),
+        ("constrain_initial", "'constrain_initial' is a constant of the problem"),
         ((), "names nothing"),
         ({"Q": jm.Parameter(np.eye(3), "definite")}, r"learn\['Q'\]: shape \(3, 3\)"),
         ({"Q": np.eye(2)}, "Wrap it in a jm.Parameter"),
@@ -205,6 +207,11 @@ def test_refuses(learn, words):
 
 
 def test_refuses_other_parameters(layer):
+    for wrong in (None, np.zeros(3), jnp.zeros(2)):
+        with pytest.raises(
+            ValueError, match="theta: is a .* Give a dict of arrays, as from init()"
+        ):
+            layer(wrong, np.zeros(2))
     with pytest.raises(ValueError, match="theta: has the names Q"):
         layer({"Q": jnp.zeros(3)}, np.zeros(2))
     theta = layer.init()
