@@ -81,7 +81,11 @@ def grid_ends(
     low = np.asarray(low - room if lower is None else lower)
     high = np.asarray(high + room if upper is None else upper)
     if not np.all(np.isfinite([low, high])):
-        cure = f"Give {where}lower and {where}upper: the limits do not bound the mapped axes"
+        free = np.flatnonzero(~np.isfinite(low) | ~np.isfinite(high))
+        which = ", ".join(map(str, free + 1))
+        cure = (
+            f"Give {where}lower and {where}upper: no limit bounds coordinate {which} of {low.size}"
+        )
         fail(f"{where}lower", "no finite range to map", cure)
     if np.any(low >= high):
         what = f"{low.tolist()} not below upper {high.tolist()}"

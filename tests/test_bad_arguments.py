@@ -256,9 +256,17 @@ CALLS = [
         lambda: mpc(states=jm.Polytope([[1, 0]], [1, 2])).validate(),
     ),
     (
-        "states.H: shape (2,) is not (rows, n). Give",
+        "states.H: shape (2,) is not (rows, n). For one row write [[1.0, 0.0]]",
         lambda: mpc(states=jm.Polytope([1, 0], [1, 2])).validate(),
     ),
+    ("B: shape (1, 2) where (2, 1) is needed. Give B.T", lambda: jm.LinearSystem(A, [[0, 0.2]])),
+    (
+        "x0s: shape (4, 3). Give (B, 2), B ≥ 1,",
+        lambda: jm.tune_weights(
+            lambda v: mpc(Q=v["Q"]), {"Q": jm.Parameter(np.eye(2), "diagonal")}, S, np.zeros((4, 3))
+        ),
+    ),
+    ("divisor: 0 divides no set. Give a finite", lambda: jm.Box(-x, x) / 0),
     (
         "states: is empty: no point satisfies all",
         lambda: mpc(states=jm.Polytope([[1, 0], [-1, 0]], [-1, -1])).validate(),
@@ -829,6 +837,8 @@ def test_rebuilt_objects_stay_what_they_are():
          lambda: jm.ADMM(iteration=3)),
         ("QP: A, l, u are missing. QP takes P, q, A, l, u,", lambda: jm.QP(np.eye(2), x)),
         ("QP: u is missing.", lambda: jm.QP(np.eye(2), x, A, l=x)),
+        ("tune_weights: there is no argument lr. Its settings are updates, optimizer",
+         lambda: jm.tune_weights(lambda v: M, {}, S, x[None], lr=0.1)),
         ("MPC: there is no argument horizons. Did you mean horizon?",
          lambda: dataclasses.replace(M, horizons=4)),
     ],

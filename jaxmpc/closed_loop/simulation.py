@@ -426,6 +426,17 @@ def _simulate(
     return replace(run, states=states, violation=jnp.append(run.violation, loop.violation(last)))
 
 
+def initial_states(owner: Any, x0s: Reals) -> np.ndarray:
+    """Return initial states (B, n), checked against the length of those of a controller or plant,
+    where that has one."""
+    require_real("x0s", x0s)
+    found, size = numpy_array(x0s), getattr(owner, "state_size", None)
+    if found.ndim != 2 or not len(found) or size not in (None, found.shape[1]):
+        cure = f"Give (B, {size or 'n'}), B ≥ 1, one initial state a row"
+        fail("x0s", f"shape {found.shape}", cure)
+    return found
+
+
 def simulate_many(
     controller: Feedback,
     plant: Plant,
@@ -473,12 +484,7 @@ def simulate_many(
     cure = "Call it outside jit, vmap and grad; inside them take jax.vmap of jm.simulate"
     for argument, value in {"x0s": x0s, "controller": controller, "plant": plant}.items():
         require_untraced(argument, value, cure)
-    require_real("x0s", x0s)
-    x0s, variations = numpy_array(x0s), dict(variations or {})
-    size = getattr(controller, "state_size", None)
-    if x0s.ndim != 2 or not len(x0s) or size not in (None, x0s.shape[1]):
-        cure = f"Give (B, {size or 'n'}), B ≥ 1, one initial state a row"
-        fail("x0s", f"shape {x0s.shape}", cure)
+    x0s, variations = initial_states(controller, x0s), dict(variations or {})
     require_variations(plant, variations, len(x0s))
     if chunk is not None and chunk < 1:
         fail("chunk", f"{chunk}", "Give a count of at least 1")

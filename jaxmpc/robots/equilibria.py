@@ -266,11 +266,27 @@ def require_rest(
             without = _accelerations(_without(file, kind), rest)
             if np.all(np.abs(without - wanted) <= AT_REST):
                 text = f"{problem}, by {cause}"
+                if kind == "limit":
+                    text += _acting_stops(file, rest.q)
                 if touching and kind in ("contact", "limit"):
                     return [f"{text}; the model is taken there"]
                 fail(argument, text, cure)
         fail(argument, problem, "See what robot.report() says is left out or ignored")
     return []
+
+
+def _acting_stops(model: "mujoco.MjModel", q: np.ndarray) -> str:
+    """Return which stops of joints act at q, with their ranges and margins, in words."""
+    found = []
+    for j in np.flatnonzero(single_joints(model)):
+        (low, high), margin = model.jnt_range[j], model.jnt_margin[j]
+        at = q[model.jnt_qposadr[j]]
+        if model.jnt_limited[j] and min(at - low, high - at) < margin:
+            pushes = f" less its margin of {margin:g}" if margin else ""
+            found.append(
+                f"{name_of(model, 'joint', j)} at {at:.3g}, [{low:.3g}, {high:.3g}]{pushes}"
+            )
+    return f" ({'; '.join(found)})" if found else ""
 
 
 def _accelerations(model: "mujoco.MjModel", rest: Rest) -> np.ndarray:

@@ -35,7 +35,7 @@ from jaxmpc.robots.physics import RK4, Physics
 from jaxmpc.robots.robot import Robot
 from jaxmpc.robots.urdf_shapes import compiled_shapes, drawable
 from jaxmpc.sets.convex_sets import Box
-from jaxmpc.sets.limits import Limit, limit_pair
+from jaxmpc.sets.limits import Limit, limit_pair, require_one_reading
 from jaxmpc.systems.system import require_period
 
 MODELS = ("joint", "pendulum", "cartpole", "arm2", "arm6", "arm7", "quadrotor")
@@ -479,6 +479,7 @@ def overridden(argument: str, limits: Box, override: Limit, part: slice) -> Box:
     lower, upper = np.array(limits.lower), np.array(limits.upper)
     if override is not None:
         size = len(lower[part])
+        require_one_reading(argument, override, size)
         for ends, end in zip((lower, upper), limit_pair(argument, override), strict=True):
             if np.shape(end) not in ((), (size,)):
                 fail(argument, f"{np.size(end)} entries where {size} are needed", "Or one number")

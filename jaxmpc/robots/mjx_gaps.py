@@ -68,8 +68,8 @@ _DROPPED = (
     ("geom_surfacevel", "surfacevel", "geom", True),
 )
 # Fields that count plugins, -1 for none, which exert forces. MuJoCo does not run without them, but
-# MJX does.
-_PLUGINS = (("actuator_plugin", "actuator"), ("body_plugin", "body"))
+# MJX does; those of actuators are refused.
+_PLUGINS = (("body_plugin", "body"),)
 
 
 def translate(model: "mujoco.MjModel") -> list[str]:
@@ -140,6 +140,7 @@ def _require_known(model: "mujoco.MjModel") -> None:
             cure = cure if kind == "actuator" else "Take that out of the file"
             fail("model", f"has {_listed(model, kind, '', rows)}, {what}, which MJX lacks", cure)
 
+    refuse("actuator", np.flatnonzero(model.actuator_plugin >= 0), "of a plugin")
     inputs = getattr(model, "actuator_ctrlnum", np.ones(0))
     refuse("actuator", np.flatnonzero(inputs != 1), "with several inputs")
     for field, known, kinds in (

@@ -248,8 +248,9 @@ class Robot(RobotDescription):
         `simulate`.
 
         positions (K, nv): coordinates of the joints once a control period. Returns states (K, n)
-        with velocities by central differences, and inputs (K, m) by inverse dynamics. NumPy; not
-        traceable. Raises ValueError for wrong shapes, or orientations that turn.
+        with velocities by central differences, and inputs (K, m) by inverse dynamics; of those the
+        last has no sample after it: `simulate(..., reference=states, input_reference=inputs[:-1])`.
+        NumPy; not traceable. Raises ValueError for wrong shapes, or orientations that turn.
         """
         nv = self.mujoco.nv
         given = host_array("positions", positions)

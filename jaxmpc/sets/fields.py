@@ -65,7 +65,13 @@ def require_matching(
     shape = np.shape(as_array(H))
     if len(shape) != ndim or shape[-1] == 0:
         wanted = "(n,)" if ndim == 1 else "(rows, n)"
-        fail(f"{argument}.{first}", f"shape {shape} is not {wanted}", "Give a list or array")
+        row = (
+            f"For one row write [{np.asarray(H).tolist()}]"
+            if len(shape) == 1 and concrete(H)
+            else ""
+        )
+        cure = row if row and ndim == 2 else f"Give an array {wanted}"
+        fail(f"{argument}.{first}", f"shape {shape} is not {wanted}", cure)
     require_dimension(argument, shape[-1], dimension)
     require_shape(f"{argument}.{second}", as_array(h), shape[:1], f"Match {first}")
 

@@ -273,7 +273,7 @@ def binding_rows(H: np.ndarray, h: np.ndarray, argument: str = "Polytope") -> np
     zero = ~H.any(axis=1)
     if np.any((h == -np.inf) | (zero & (h < 0))):
         what = "is empty: a row reads 0'x <= h < 0 or has h = -inf"
-        raise Empty(f"{argument}: {what}. Remove that row")
+        raise Empty(f"{argument}: {what}. Loosen that row")
     return np.flatnonzero(~zero & (h < np.inf))
 
 

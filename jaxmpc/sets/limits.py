@@ -85,6 +85,8 @@ def joint_limits(
     pairs = {key: limit_pair(key, value) for key, value in limits.items()}
     ends = [(key, end) for key, pair in pairs.items() for end in pair]
     n = max((end.size for _, end in ends if end.ndim), default=1) if names is None else len(names)
+    for key, value in limits.items():
+        require_one_reading(key, value, n)
     for key, end in ends:
         if end.shape not in ((), (n,)):
             fail(key, f"{end.size} entries for {n} joints", "Give one a joint, or a number")
@@ -171,11 +173,30 @@ def limit_pair(argument: str, limit: Any) -> tuple[np.ndarray, np.ndarray]:
         return np.array(-np.inf), np.array(np.inf)
     if not isinstance(limit, tuple | list) and np.ndim(limit) == 0:
         bound = host_array(argument, limit)
+        if bound < 0:
+            fail(argument, f"{limit!r} is negative", "Give v ≥ 0 for |.| ≤ v, or (lower, upper)")
         return -bound, bound
     if len(limit) != 2:
         each = "each a number or one a joint, or one number v for |.| ≤ v"
         fail(argument, f"{limit!r} is not a pair", f"Give (lower, upper), {each}")
     return host_array(argument, limit[0]), host_array(argument, limit[1])
+
+
+def require_one_reading(argument: str, limit: Any, count: int) -> None:
+    """Raise where two numbers for `count` = 2 coordinates may be meant as one limit each: those
+    that leave out 0, read as (lower, upper)."""
+    pair = isinstance(limit, tuple | list | np.ndarray) and not any(map(np.ndim, limit))
+    if count != 2 or not pair:
+        return
+    a, b = (float(v) for v in limit)
+    if a > 0 or b < 0:
+        c, d, low, high = abs(a), abs(b), min(a, b), max(a, b)
+        each, ends = (
+            f"([{-c:g}, {-d:g}], [{c:g}, {d:g}])",
+            f"([{low:g}, {low:g}], [{high:g}, {high:g}])",
+        )
+        cure = f"Give {each} for one limit each, {ends} for lower and upper ends"
+        fail(argument, f"[{a:g}, {b:g}] leaves out 0 as (lower, upper) of 2 coordinates", cure)
 
 
 def row_violations(limits: Limits, x: Values) -> Values:

@@ -493,14 +493,19 @@ class Polytope(LinearSet):
         """
         self._require_fields("Polytope")
         H, h = self.half_spaces()
-        binding = geometry.binding_rows(H, h)
-        reach = np.zeros(len(h))
         if isinstance(other, ConvexSet):
             other.validate("other", self.dimension)
             other = other.spread(self.dimension) if isinstance(other, LinearSet) else other
-            reach[binding] = other.support(H[binding])
+            support: Any = other.support
         else:
-            reach[binding] = (H[binding] @ points("other", other, self.dimension).T).max(axis=1)
+            corners = points("other", other, self.dimension)
+            support = lambda rows: (rows @ corners.T).max(axis=1)
+        try:
+            binding = geometry.binding_rows(H, h)
+        except Empty:
+            return Polytope.empty(self.dimension)
+        reach = np.zeros(len(h))
+        reach[binding] = support(H[binding])
         return Polytope(H, cleaned(h - reach, np.abs(h) + np.abs(reach)))
 
     def reduce(self) -> "Polytope":

@@ -2,7 +2,7 @@
 
 `A @ P` is the image, `P @ A` the preimage, `P + Q` the Minkowski sum, `P - Q` the Pontryagin
 difference, `P & Q` the intersection, `P <= Q` and `P == Q` compare sets to 1e-9 of their size,
-`x in P` asks for one point; `P + x`, `P - x`, `-P` and `2 * P` move, mirror and scale.
+`x in P` asks for one point; `P + x`, `x - P`, `2 * P` and `P / 2` move, mirror and scale.
 """
 
 from abc import ABC, abstractmethod
@@ -219,6 +219,15 @@ class BasicSet(ConvexSet):
         if isinstance(other, BasicSet):
             return self.pontryagin_difference(other)
         return self.translate(-vector("by", other, self.dimension))
+
+    def __rsub__(self, other: Any) -> Any:
+        return (-self).translate(other)
+
+    def __truediv__(self, divisor: Any) -> Any:
+        require_real("divisor", divisor)
+        if np.ndim(divisor) or not np.isfinite(divisor) or divisor == 0:
+            fail("divisor", f"{shown(divisor)} divides no set", "Give a finite number, not 0")
+        return self._times(1 / float(divisor))
 
     def __and__(self, other: Any) -> Any:
         return self.intersect(other)

@@ -58,6 +58,7 @@ def open_group(path: Path | str, mode: Any) -> "zarr.Group":
     """Open a store; raise ValueError where `path` holds something else."""
     import zarr
 
+    cure = "Choose another output folder" if mode != "r" else "Give what a sweep wrote"
     try:
         group = zarr.open_group(zarr_place(path), mode=mode, use_consolidated=False)
         there = "fingerprint" in group.attrs
@@ -65,9 +66,9 @@ def open_group(path: Path | str, mode: Any) -> "zarr.Group":
         if isinstance(path, Path) and (path / "zarr.json").is_file():
             fail(str(path), "is damaged: its metadata cannot be read", "Overwrite it")
         text = str(error).splitlines()[0] if str(error) else type(error).__name__
-        fail(str(path), f"is no sweep store ({text})", "Choose another output folder")
+        fail(str(path), f"is no sweep store ({text})", cure)
     if not there:
-        fail(str(path), "is a zarr group but no sweep store", "Choose another output folder")
+        fail(str(path), "is a zarr group but no sweep store", cure)
     return group
 
 

@@ -75,6 +75,9 @@ class LinearSystem:
             return  # `validate` says what is wrong, and `in_axes` are a system without arrays
         n = self.n
         require_last("A", self.A, (n, n), "A must be square")
+        rows = np.shape(as_array(self.B))[-2]
+        if rows != n == self.m:
+            require_last("B", self.B, (n, rows), "Give B.T")
         require_last("B", self.B, (n, self.m), "Give B as many rows as A")
         if dimensions(self.c):
             require_last("c", self.c, (n,), "Give one number a state, or None")

@@ -7,7 +7,7 @@ step. An interrupt (Ctrl-C) ends the descent early, with all that it has found.
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ import optax
 from tqdm.std import tqdm
 
 from jaxmpc.batches import chosen_devices
-from jaxmpc.checks import fail, whole
+from jaxmpc.checks import fail, nearest, whole
 from jaxmpc.files import fingerprint, read_arrays, remove_partial, write_arrays
 from jaxmpc.pytrees import record
 from jaxmpc.qp.linalg import float64_arrays
@@ -52,6 +52,20 @@ class Settings:
     checkpoint: str | Path | None = None
     progress: bool = False
     devices: Any = None
+
+    @classmethod
+    def of(cls, function: str, given: Mapping[str, Any]) -> "Settings":
+        """Return the settings that a function was given; raise TypeError, in its name, for
+        others."""
+        known = [f.name for f in fields(cls)]  # type: ignore[arg-type]
+        for word in given:
+            if word not in known:
+                near, rate = nearest(word, known), "a learning rate is that of an optimizer"
+                raise TypeError(
+                    f"{function}: there is no argument {word}. {near}Its settings are "
+                    f"{', '.join(known)}; {rate}, optax.adam(0.05)"
+                )
+        return cls(**given)
 
     def validate(self) -> None:
         """Raise ValueError for a count or fraction that makes no sense, and for wrong devices."""

@@ -46,7 +46,7 @@ def tune_feasible_set(
     together, before any compile.
     """
     require_parameters(parameters)
-    chosen = Settings(**settings)
+    chosen = Settings.of("tune_feasible_set", settings)
     chosen.validate()
     x0s = np.asarray(x0s, np.float64)
     if x0s.ndim != 2 or not len(x0s):

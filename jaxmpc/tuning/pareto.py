@@ -104,7 +104,7 @@ def trade_off(
     known = ("reference", "input_reference", "variations", "conditions", "solver", "design_loss")
     fixed = {name: options.pop(name) for name in (*known, "mode") if name in options}
     functions = SeveralLosses(dict(losses))
-    settings = Settings(**options)
+    settings = Settings.of("trade_off", options)
     loops = prepared(make_mpc, parameters, plant, x0s, functions, steps, settings, **fixed)
     _, start = loops.validate(raw(parameters))
     initial = np.array([start[f"{TERM}{name}"] for name in losses])

@@ -101,7 +101,7 @@ def tune_solver(
     Raises ValueError for bad input, before any compile, and for states all proved infeasible;
     on Ctrl-C `Interrupted`, as `tune_weights`.
     """
-    chosen = Settings(**{"updates": 200, "batch": 32, **settings})
+    chosen = Settings.of("tune_solver", {"updates": 200, "batch": 32, **settings})
     chosen.validate()
     solver = SOLVER if solver is None else solver
     references = reference, input_reference

@@ -13,7 +13,12 @@ import optax
 from jaxmpc.arrays import Reals, numpy_array
 from jaxmpc.batches import chosen_devices
 from jaxmpc.checks import fail, nearest, whole
-from jaxmpc.closed_loop.simulation import Conditions, Run, require_variations
+from jaxmpc.closed_loop.simulation import (
+    Conditions,
+    Run,
+    initial_states,
+    require_variations,
+)
 from jaxmpc.mpc.problem import MPC, harden
 from jaxmpc.mpc.stagewise.nonlinear import as_argument
 from jaxmpc.qp.admm import ADMM
@@ -116,7 +121,7 @@ def tune_weights(
     Raises ValueError for what does not fit together, before any compile, and on Ctrl-C
     `Interrupted`, a KeyboardInterrupt that holds the `TuningRun` of the finished steps.
     """
-    chosen = Settings(**settings)
+    chosen = Settings.of("tune_weights", settings)
     loops = prepared(
         make_mpc,
         parameters,
@@ -157,9 +162,7 @@ def prepared(
     """Return the closed loops of `tune_weights`, whose arguments these are, without compiling."""
     require_parameters(parameters)
     settings.validate()
-    x0s = numpy_array(x0s)
-    if x0s.ndim != 2 or not len(x0s):
-        fail("x0s", f"shape {x0s.shape}", "Give initial states (B, n)")
+    x0s = initial_states(plant, x0s)
     variations = {name: numpy_array(v) for name, v in dict(variations or {}).items()}
     require_variations(plant, variations, len(x0s))
     if mode not in MODES:

@@ -257,12 +257,6 @@ NAMED = {
         {"equality": '<weld name="e" body1="b" solref=".1 1" torquescale=".5"/>'},
         "equality e pushes otherwise",
     ),
-    "plugin": (
-        {"top": '<extension><plugin plugin="mujoco.pid"/></extension>',
-         "actuator": '<plugin name="m" joint="j" plugin="mujoco.pid" ctrlrange="-2 2">'
-         '<config key="kp" value="20"/></plugin>'},
-        "the plugin of actuator m",
-    ),
     "flag sleep": ({"flag": '<flag sleep="enable"/>'}, "sleep of bodies at rest"),
     "noslip": (
         {"world": FLOOR.format(""), "option": 'cone="elliptic" noslip_iterations="5"'},
@@ -278,6 +272,10 @@ UNSEEN = ("noslip", "flag sleep")
 
 # What is refused at load.
 REFUSED = {
+    "plugin": ({"top": '<extension><plugin plugin="mujoco.pid"/></extension>',
+                "actuator": '<plugin name="m" joint="j" plugin="mujoco.pid" ctrlrange="-2 2">'
+                '<config key="kp" value="20"/></plugin>'},
+               "has actuator m, of a plugin, which MJX lacks"),
     "orientation": ({"second": BALL.format(""),
                      "actuator": '<orientation name="m" joint="k" kp="2" kv=".1"/>'},
                     "has actuator m, with several inputs, which MJX lacks"),

@@ -48,7 +48,13 @@ def test_output_limits_are_rows_of_C():
     [
         (lambda: joint_limits([1, 2, 3]), "position: .* is not a pair"),
         (lambda: joint_limits((1, -1)), r"position: is empty: lower\[0\] = 1"),
-        (lambda: joint_limits(-1), "position: is empty"),
+        (lambda: joint_limits(-1), "position: -1 is negative. Give v ≥ 0"),
+        (
+            lambda: joint_limits(1, torque=[5, 10], names=("a", "b")),
+            r"torque: .5, 10. leaves out 0 .* Give \(\[-5, -10\], \[5, 10\]\) for one limit each, "
+            r"\(\[5, 5\], \[10, 10\]\) for lower",
+        ),
+        (lambda: joint_limits(([-1, -1], [1, 1]), (-2, -1)), "velocity: .-2, -1. leaves out 0"),
         (lambda: joint_limits(torque=(1, -1)), "torque: is empty"),
         (lambda: joint_limits(velocity=np.nan), "velocity.lower: holds NaN"),
         (lambda: joint_limits(([-1, -1], [1, 1]), ([-1] * 3, 1)), "position: 2 entries for 3"),

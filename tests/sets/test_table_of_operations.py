@@ -416,3 +416,30 @@ def test_flat_hulls_in_other_units_against_their_points(seed):
             size = np.abs(points).max(axis=0)
             d = rng.normal(size=(10, points.shape[1])) / size
             np.testing.assert_allclose(found.support(d), (d @ points.T).max(axis=1), atol=1e-9)
+
+
+def test_of_an_empty_set_all_that_is_a_set_is_empty():
+    """However it is written; so loops of reachability may go on after their set has vanished."""
+    box, one = Box([-1, -1], [1, 1]), np.ones(2)
+    for empty in (Polytope.empty(2), Box([1, 1], [0, 0]), box & Polytope([[1, 0]], [-3])):
+        for found in (
+            empty - box, empty + box, box + empty, empty & box, np.eye(2) @ empty,
+            empty @ np.eye(2),
+            -empty, 2 * empty, empty / 2, empty + one, empty - one, one - empty,
+            empty - (box & box), empty - Zonotope([0, 0], np.eye(2)),
+        ):  # fmt: skip
+            assert found.is_empty() and found.volume() == 0
+    X, U = Polytope([[1, 0], [-1, 0], [0, 1], [0, -1]], [2, 1, 3, 0.5]), Box([-0.1], [0.1])
+    A, B, Y = np.array([[1, 0.5], [0, 1]]), np.array([[0], [1.0]]), X
+    for _ in range(3):
+        Y = ((Y - box) + (-B) @ U) @ A & X
+    assert Y.is_empty()
+
+
+def test_sets_are_divided_and_mirrored_at_points():
+    P = Polytope([[1, 0], [-1, 0], [0, 1], [0, -1]], [2, 1, 3, 0.5])
+    for found, lower, upper in (
+        (P / 2, [-0.5, -0.25], [1, 1.5]), ([1, 2] - P, [-1, -1], [2, 2.5]),
+        (np.array([1.0, 2]) - P.bounding_box(), [-1, -1], [2, 2.5]), (P / -0.5, [-4, -6], [2, 1]),
+    ):  # fmt: skip
+        assert found == Box(lower, upper)

@@ -10,6 +10,7 @@ from damage import turned_bits
 
 import jaxmpc as jm
 from jaxmpc import store
+from jaxmpc.app.cli import main
 from jaxmpc.feasible.pipeline import PROOFS
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.stored import open_labels
@@ -285,3 +286,12 @@ class TestFindsWhatIsWrong:
 def test_what_holds_no_map(tmp_path):
     with pytest.raises(ValueError, match="holds no labels"):
         verify_map(tmp_path)
+
+
+def test_a_map_made_from_python_is_verified(tmp_path, capsys):
+    """Its configuration names no system: the problem is the stored one."""
+    jm.feasible.sweep_into(tmp_path / "map.zarr", mpc(), [np.linspace(-1, 1, 4)] * 2)
+    found = verify_map(tmp_path / "map.zarr")
+    assert found.passed and not found.problems and found.verified > 10
+    assert main(["verify", str(tmp_path / "map.zarr")]) == 0
+    assert "the problem is the stored one" in capsys.readouterr().err

@@ -82,6 +82,12 @@ def contradictions(attributes: Mapping[str, Any], axes: Mapping[str, np.ndarray]
             lines = () if region is None else region.along
             view = (None, None) if region is None else (region.axes, region.fixed)
             built = problem_of(made.build_mpc(), *view).plain()
+        elif "robot" not in config:
+            text = (
+                "made by sweep_into: the problem is the stored one, no configuration makes it again"
+            )
+            print(text, file=sys.stderr)
+            return []
         elif not _is_here(config["robot"]):
             print(
                 f"{config['robot']}: is not here; the map's problem is not built from it again",
