@@ -6,6 +6,7 @@ import hashlib
 import re
 import warnings
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
 from importlib import resources
 from importlib.metadata import version
 from pathlib import Path
@@ -117,7 +118,8 @@ def load_robot(
         lack.take_out(host)
     inputs, input_sources = input_limits(host)
     limits = overridden("torque", inputs, torque, slice(None))
-    input_sources = input_sources if torque is None else ["argument"] * host.nu
+    if torque is not None:
+        input_sources = _argument_sources(inputs, limits, slice(None))
     smooth = copy.deepcopy(host)
     for kind in ("contact", "limit", "frictionloss") if equalities(host) else ("constraint",):
         smooth.opt.disableflags |= flag(kind)
@@ -131,6 +133,7 @@ def load_robot(
     q, act, origin = _home(host, home)
     start, plant = np.concatenate([q, np.zeros(host.nv), act]), Physics(host)
     _warn_of_meshes(name, host)
+    _warn_of_limits(name, labels, sources, named(host, "actuator", "u"), input_sources)
     idle, without, unlike = compared(given, plant, missing, inputs, start)
     _warn_of_differences(name, host, without, unlike, file.lost)
     notes = {
@@ -256,6 +259,17 @@ def _periods(
         problem = f"{control_period:g} s is no multiple of the physics step {h:g} s"
         fail("control_period", problem, "Give whole multiples, or another timestep")
     return substeps, control_period
+
+
+def _warn_of_limits(name: str, *labels_and_sources: Sequence[str]) -> None:
+    """Warn where arguments let the plant go where its file does not."""
+    labels, sources, inputs, input_sources = labels_and_sources
+    pairs = zip([*labels, *inputs], [*sources, *input_sources], strict=True)
+    wide = [f"{v} (there {text.split(BEYOND)[1].strip()})" for v, text in pairs if BEYOND in text]
+    if wide:
+        what = f"has wider limits than its file, by arguments: {', '.join(wide)}"
+        plant = "The plant has the stops of the file; inputs are not clamped as MuJoCo clamps them"
+        warnings.warn(f"robot {name} {what}. {plant}", stacklevel=3)
 
 
 def _warn_of_differences(
@@ -462,10 +476,13 @@ def state_limits(
         at = 2 * nv + host.actuator_actadr[k]
         lower[at], upper[at] = host.actuator_actrange[k]
         sources[at] = "file, actrange"
-    limits = overridden("position", Box(lower, upper), position, slice(0, nv))
+    of_the_file, places = Box(lower, upper), slice(0, nv)
+    limits = overridden("position", of_the_file, position, places)
     limits = overridden("velocity", limits, velocity, rates)
-    for given, part in ((position, slice(0, nv)), (velocity, rates)):
-        sources[part] = sources[part] if given is None else ["argument"] * nv
+    if position is not None:
+        sources[places] = _argument_sources(of_the_file, limits, places)
+    if velocity is not None:
+        sources[rates] = ["argument"] * nv
     slow, fast = np.asarray(limits.lower)[rates], np.asarray(limits.upper)[rates]
     if np.any((slow > 0) | (fast < 0)):
         i = int(np.argmax((slow > 0) | (fast < 0)))
@@ -486,6 +503,16 @@ def overridden(argument: str, limits: Box, override: Limit, part: slice) -> Box:
             ends[part] = end
     Box(lower[part], upper[part]).validate(argument)
     return Box(lower, upper)
+
+
+def _argument_sources(of_the_file: Box, given: Box, part: slice) -> list[str]:
+    """Return the sources of limits that are arguments: with the limits of the file where these are
+    narrower."""
+    ends = (np.asarray(end)[part] for end in (*of_the_file.bounds(), *given.bounds()))
+    return [
+        f"argument, {BEYOND} [{low:g}, {high:g}]" if a < low or b > high else "argument"
+        for low, high, a, b in zip(*ends, strict=True)
+    ]
 
 
 def compiled_mjcf(path: Path, motors: bool = False) -> "tuple[mujoco.MjModel, tuple[str, ...]]":
@@ -552,6 +579,8 @@ _ROOM = 1e-9
 # Mass of a moving link that has none, of the robot's: a ball of water of that mass.
 _SHARE = 1e-4
 _WATER = 1000.0
+# Of limits that are arguments: what stands before those of the file.
+BEYOND = "beyond the file's"
 # Entries of an inertia in a URDF, those of the upper triangle row by row.
 _AXES = ("xx", "xy", "xz", "yy", "yz", "zz")
 

@@ -588,7 +588,7 @@ BAD_FILES = {
         "velocity_limit: 2 numbers in the file, 1 dofs. Give one a dof",
     ),
     "position": (single(), {"position": (1, -1)}, r"position: is empty: lower\[0\] = 1"),
-    "velocity": (single(), {"velocity": -2}, r"velocity: is empty: lower\[0\] = 2"),
+    "velocity": (single(), {"velocity": -2}, r"velocity: -2 is negative. Give v"),
     "torque": (single(), {"torque": ([3], [2])}, r"torque: is empty: lower\[0\] = 3"),
     "sizes": (single(), {"torque": ([1, 2], 3)}, "torque: 2 entries where 1 are needed"),
     "NaN": (single(), {"velocity": np.nan}, "velocity.*NaN"),
@@ -686,3 +686,29 @@ def test_a_hovering_body_feels_its_rates(integrator):
         moved = jax.jit(lambda x, d: jax.jvp(step, (x,), (d,))[1])(x, rates)
         h = robot.mujoco.opt.timestep
         np.testing.assert_allclose(moved[3:7], [0, *(h / 2 * rates[10:])], rtol=1e-3, atol=1e-12)
+
+
+SWING = """<mujoco><worldbody><body gravcomp="1"><joint name="a" axis="0 1 0" range="-60 60"{}/>
+<geom size=".1" pos="0 0 -.3"/></body></worldbody>
+<actuator><motor name="m" joint="a" ctrlrange="-3 3"/></actuator></mujoco>"""
+
+
+def test_arguments_that_go_beyond_the_file_are_told(tmp_path):
+    file = tmp_path / "swing.xml"
+    file.write_text(SWING.format(""))
+    assert "beyond" not in str(jm.load_robot(file, torque=2, position=0.5).report())
+    with pytest.warns(UserWarning, match=r"wider limits .*: a \(there \[-1.0472, .*\), m \(there"):
+        robot = jm.load_robot(file, torque=10, position=(-0.5, 1.5))
+    assert "argument, beyond the file's [-3, 3]" in str(robot.report())
+    with pytest.warns(UserWarning, match=r"by arguments: m \(there \[-3, 3\]\)\. The plant"):
+        jm.load_robot(file, torque=([-1], [4]))
+
+
+def test_a_stop_that_takes_a_rest_away_is_named_with_its_margin(tmp_path):
+    """MuJoCo takes margins in radians, also where angles are in degrees."""
+    file = tmp_path / "swing.xml"
+    file.write_text(SWING.format(' margin="1"'))
+    with pytest.raises(
+        ValueError, match=r"\(joint a at 0.8, \[-1.05, 1.05\] less its margin of 1\)"
+    ):
+        jm.load_robot(file).equilibrium([0.8])
