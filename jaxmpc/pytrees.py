@@ -61,6 +61,17 @@ def _naming_arguments(make: Callable[..., None]) -> Callable[..., None]:
     return __init__
 
 
+# Names that the literature, other libraries and the files of `jaxmpc` give to arguments.
+ELSEWHERE = {
+    **{word: "terminal_cost" for word in ("P", "Qf", "QN", "terminal_weight")},
+    **{word: "horizon" for word in ("N", "T", "steps")},
+    **{word: "states" for word in ("x_min", "x_max", "X", "state_limits")},
+    **{word: "inputs" for word in ("u_min", "u_max", "U", "input_limits")},
+    **{word: "iterations" for word in ("max_iter", "maxiter", "iters")},
+    **{word: "eps" for word in ("tol", "eps_abs", "eps_rel")},
+}
+
+
 def _require_arguments(
     name: str, known: list[inspect.Parameter], values: int, named: Iterable[str]
 ) -> None:
@@ -70,7 +81,8 @@ def _require_arguments(
     takes = f"{name} takes {', '.join(names)}"
     for word in named:
         if word not in names:
-            near = nearest(word, names)
+            meant = ELSEWHERE.get(word)
+            near = f"Did you mean {meant}? " if meant in names else nearest(word, names)
             raise TypeError(f"{name}: there is no argument {word}. {near}{takes}") from None
     needed = [p.name for p in known[values:] if p.default is p.empty and p.name not in named]
     if needed:

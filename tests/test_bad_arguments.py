@@ -829,7 +829,13 @@ def test_rebuilt_objects_stay_what_they_are():
 @pytest.mark.parametrize(
     "message, call",
     [
-        ("MPC: there is no argument u_min. MPC takes system, Q, R", lambda: mpc(u_min=-1)),
+        ("MPC: there is no argument u_min. Did you mean inputs?", lambda: mpc(u_min=-1)),
+        ("MPC: there is no argument terminal_weight. Did you mean terminal_cost?",
+         lambda: mpc(terminal_weight=1)),
+        ("MPC: there is no argument P. Did you mean terminal_cost?", lambda: mpc(P=1)),
+        ("ADMM: there is no argument max_iter. Did you mean iterations?",
+         lambda: jm.ADMM(max_iter=9)),
+        ("MPC: there is no argument max_iter. MPC takes", lambda: mpc(max_iter=9)),
         ("LinearSystem: there is no argument C. LinearSystem", lambda: jm.LinearSystem(A, B, C=A)),
         ("LinearSystem: there is no argument state_name. Did you mean state_names?",
          lambda: jm.LinearSystem(A, B, state_name=("q", "v"))),

@@ -198,8 +198,8 @@ class MPC:
         prestabilise: gain K (m, n) of the substitution u = Kx + v, which keeps long predictions of
             unstable plants well-conditioned; True: the LQR gain; False: none; None: the LQR gain
             where A has an eigenvalue outside the unit circle. It changes rounding, not the problem;
-            with control_horizon there is none. Inside `jit` with A as an argument give K itself:
-            None and True read values.
+            with control_horizon there is none. Inside `jit` with A as an argument None is none,
+            since it reads A: give True, or K itself.
         soft: `Soft`, or a tuple of them.
         outputs: `Outputs`, or a tuple of them.
         constrained_stages: the k in 0..N at which `states` hold, where that is another index set.

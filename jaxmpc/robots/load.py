@@ -394,21 +394,39 @@ def coordinate_names(host: "mujoco.MjModel") -> tuple[tuple[str, ...], tuple[str
 
 
 def input_unit(host: "mujoco.MjModel", i: int) -> str:
-    """Return the unit of an actuator's input: force or torque of a joint's motor, else unknown."""
-    if not _is_motor(host, i) or abs(host.actuator_gainprm[i, 0] * host.actuator_gear[i, 0]) != 1:
+    """Return the unit of an input: the force of a joint's motor, the position or velocity of a
+    servo of gear 1, else unknown."""
+    gain, gear, bias = (
+        v[i] for v in (host.actuator_gainprm[:, 0], host.actuator_gear[:, 0], host.actuator_biasprm)
+    )
+    if not _moves_one_joint(host, i):
         return ""
-    return "N" if host.jnt_type[host.actuator_trnid[i, 0]] == SLIDE else "N m"
+    slides = host.jnt_type[host.actuator_trnid[i, 0]] == SLIDE
+    if _is_motor(host, i):
+        return ("N" if slides else "N m") if abs(gain * gear) == 1 else ""
+    length = "m" if slides else "rad"
+    if abs(gear) == 1 and host.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE and not bias[0]:
+        if bias[1] == -gain:
+            return length
+        if not bias[1] and bias[2] == -gain:
+            return f"{length}/s"
+    return ""
 
 
-def _is_motor(host: "mujoco.MjModel", i: int) -> bool:
-    """Return whether an actuator puts a multiple of its input on one hinge or slide joint."""
+def _moves_one_joint(host: "mujoco.MjModel", i: int) -> bool:
+    """Return whether an actuator of fixed gain, without a state, moves one hinge or slide joint."""
     return (
         host.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT
         and host.actuator_dyntype[i] == mujoco.mjtDyn.mjDYN_NONE
         and host.jnt_type[host.actuator_trnid[i, 0]] in (SLIDE, HINGE)
         and host.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_FIXED
-        and host.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_NONE
     )
+
+
+def _is_motor(host: "mujoco.MjModel", i: int) -> bool:
+    """Return whether an actuator puts a multiple of its input on one hinge or slide joint."""
+    no_bias = host.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_NONE
+    return _moves_one_joint(host, i) and bool(no_bias)
 
 
 def input_limits(host: "mujoco.MjModel") -> tuple[Box, list[str]]:

@@ -45,8 +45,8 @@ def number_of(model: "mujoco.MjModel", kind: str, name: str) -> int:
 
 
 def name_of(model: "mujoco.MjModel", kind: str, i: Any) -> str:
-    """Return "joint hip", or "joint 3" (counted from 1) where it has no name."""
-    return f"{kind} {mujoco.mj_id2name(model, _type_of(kind), int(i)) or int(i) + 1}"
+    """Return "joint hip", or "joint of id 2", as MuJoCo counts, where it has no name."""
+    return f"{kind} {mujoco.mj_id2name(model, _type_of(kind), int(i)) or f'of id {int(i)}'}"
 
 
 def _type_of(kind: str) -> Any:

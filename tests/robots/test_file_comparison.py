@@ -282,7 +282,7 @@ REFUSED = {
     "integrator implicit": ({"option": 'integrator="implicit"'}, "has the integrator implicit,"),
     "integrator discrete": ({"option": 'integrator="discrete"'}, "has the integrator discrete,"),
     "slidercrank": ({"actuator": '<motor cranksite="s" slidersite="w" cranklength=".5"/>'},
-                    "has actuator 1, of the type slidercrank, which MJX lacks"),
+                    "has actuator of id 0, of the type slidercrank, which MJX lacks"),
     "flag override": ({"flag": '<flag override="enable"/>'}, "has the flag override, which MJX"),
     "dyntype user": ({"actuator": GENERAL.format('dyntype="user"')}, "has actuator m, of the type"),
     "adhesion actuator": ({"actuator": '<adhesion name="g" body="b" ctrlrange="0 1"/>',

@@ -712,3 +712,20 @@ def test_a_stop_that_takes_a_rest_away_is_named_with_its_margin(tmp_path):
         ValueError, match=r"\(joint a at 0.8, \[-1.05, 1.05\] less its margin of 1\)"
     ):
         jm.load_robot(file).equilibrium([0.8])
+
+
+def test_units_of_inputs(tmp_path):
+    """Servos of gear 1 take the position or velocity of their joint, in radians also where angles
+    are in degrees."""
+    file = tmp_path / "units.xml"
+    kinds = {
+        '<motor joint="a"/>': "N m", '<motor joint="s"/>': "N", '<motor joint="a" gear="2"/>': "",
+        '<position joint="a" kp="9"/>': "rad", '<position joint="s" kp="9" kv="1"/>': "m",
+        '<velocity joint="a" kv="3"/>': "rad/s", '<position joint="a" kp="9" gear="2"/>': "",
+    }  # fmt: skip
+    file.write_text(
+        '<mujoco><worldbody><body gravcomp="1"><joint name="a" axis="0 1 0"/>'
+        '<joint name="s" type="slide"/><geom size=".1"/></body></worldbody>'
+        f"<actuator>{''.join(kinds)}</actuator></mujoco>"
+    )
+    assert jm.load_robot(file).input_units == tuple(kinds.values())
