@@ -16,15 +16,7 @@ from jaxmpc.arrays import Reals, as_weight
 from jaxmpc.checks import concrete, fail, whole
 from jaxmpc.closed_loop.feedback import first_row, one_state
 from jaxmpc.mpc.controller import Controller, zeros_of
-from jaxmpc.mpc.plan import (
-    Control,
-    Plan,
-    WarmStart,
-    anchored,
-    applied,
-    limited,
-    require_before,
-)
+from jaxmpc.mpc.plan import Control, Plan, WarmStart, anchored, applied, limited, require_before
 from jaxmpc.mpc.problem import MPC, Outputs, Soft, as_tuple, soften
 from jaxmpc.mpc.rows import layout
 from jaxmpc.mpc.stagewise.nonlinear import NonlinearMPC, Task, task_layout

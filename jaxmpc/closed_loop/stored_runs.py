@@ -11,9 +11,8 @@ import numpy as np
 
 from jaxmpc.arrays import Reals, numpy_array
 from jaxmpc.batches import Part, Timing, first_rows, padded, work_off
-from jaxmpc.checks import fail
 from jaxmpc.closed_loop.feedback import Feedback
-from jaxmpc.closed_loop.simulation import Run, simulate_many
+from jaxmpc.closed_loop.simulation import Run, initial_states, simulate_many
 from jaxmpc.closed_loop.variations import plant_numbers
 from jaxmpc.files import check_results, fingerprint
 from jaxmpc.pytrees import record
@@ -118,9 +117,7 @@ class _Loops:
 
     def validate(self) -> None:
         """Raise ValueError for starts and factors of other shapes, before there is a store."""
-        size = self.robot.state_size
-        if self.x0s.ndim != 2 or self.x0s.shape[1] != size or not len(self.x0s):
-            fail("x0s", f"shape {self.x0s.shape}", f"Give (B, {size}), B ≥ 1")
+        initial_states(self.robot, self.x0s)
         if self.factors:
             numbers = plant_numbers(self.robot, self.factors)
             self.robot.vary(**{key: value[0] for key, value in numbers.items()})

@@ -39,6 +39,8 @@ from jaxmpc.sets.convex_sets import Box
 from jaxmpc.sets.limits import Limit, limit_pair, require_one_reading
 from jaxmpc.systems.system import require_period
 
+# The source of a limit that is an argument and wider than the file's, which stands after it.
+BEYOND = "argument, beyond the file's "
 MODELS = ("joint", "pendulum", "cartpole", "arm2", "arm6", "arm7", "quadrotor")
 # Pairs of meshes in contact that compile within some twenty seconds.
 _MESHES = 4
@@ -133,7 +135,8 @@ def load_robot(
     q, act, origin = _home(host, home)
     start, plant = np.concatenate([q, np.zeros(host.nv), act]), Physics(host)
     _warn_of_meshes(name, host)
-    _warn_of_limits(name, labels, sources, named(host, "actuator", "u"), input_sources)
+    input_names = tuple(named(host, "actuator", "u"))
+    _warn_of_limits(name, [*labels, *input_names], [*sources, *input_sources])
     idle, without, unlike = compared(given, plant, missing, inputs, start)
     _warn_of_differences(name, host, without, unlike, file.lost)
     notes = {
@@ -158,7 +161,7 @@ def load_robot(
         name=name,
         state_names=labels,
         state_units=units,
-        input_names=tuple(named(host, "actuator", "u")),
+        input_names=input_names,
         input_units=tuple(input_unit(host, i) for i in range(host.nu)),
         notes=tuple((kind, text) for kind, texts in notes.items() for text in texts),
     )
@@ -261,11 +264,10 @@ def _periods(
     return substeps, control_period
 
 
-def _warn_of_limits(name: str, *labels_and_sources: Sequence[str]) -> None:
+def _warn_of_limits(name: str, labels: Sequence[str], sources: Sequence[str]) -> None:
     """Warn where arguments let the plant go where its file does not."""
-    labels, sources, inputs, input_sources = labels_and_sources
-    pairs = zip([*labels, *inputs], [*sources, *input_sources], strict=True)
-    wide = [f"{v} (there {text.split(BEYOND)[1].strip()})" for v, text in pairs if BEYOND in text]
+    pairs = zip(labels, sources, strict=True)
+    wide = [f"{v} (there {s.removeprefix(BEYOND)})" for v, s in pairs if s.startswith(BEYOND)]
     if wide:
         what = f"has wider limits than its file, by arguments: {', '.join(wide)}"
         plant = "The plant has the stops of the file; inputs are not clamped as MuJoCo clamps them"
@@ -396,11 +398,10 @@ def coordinate_names(host: "mujoco.MjModel") -> tuple[tuple[str, ...], tuple[str
 def input_unit(host: "mujoco.MjModel", i: int) -> str:
     """Return the unit of an input: the force of a joint's motor, the position or velocity of a
     servo of gear 1, else unknown."""
-    gain, gear, bias = (
-        v[i] for v in (host.actuator_gainprm[:, 0], host.actuator_gear[:, 0], host.actuator_biasprm)
-    )
     if not _moves_one_joint(host, i):
         return ""
+    gain, gear = host.actuator_gainprm[i, 0], host.actuator_gear[i, 0]
+    bias = host.actuator_biasprm[i]
     slides = host.jnt_type[host.actuator_trnid[i, 0]] == SLIDE
     if _is_motor(host, i):
         return ("N" if slides else "N m") if abs(gain * gear) == 1 else ""
@@ -528,7 +529,7 @@ def _argument_sources(of_the_file: Box, given: Box, part: slice) -> list[str]:
     narrower."""
     ends = (np.asarray(end)[part] for end in (*of_the_file.bounds(), *given.bounds()))
     return [
-        f"argument, {BEYOND} [{low:g}, {high:g}]" if a < low or b > high else "argument"
+        f"{BEYOND}[{low:g}, {high:g}]" if a < low or b > high else "argument"
         for low, high, a, b in zip(*ends, strict=True)
     ]
 
@@ -597,8 +598,6 @@ _ROOM = 1e-9
 # Mass of a moving link that has none, of the robot's: a ball of water of that mass.
 _SHARE = 1e-4
 _WATER = 1000.0
-# Of limits that are arguments: what stands before those of the file.
-BEYOND = "beyond the file's"
 # Entries of an inertia in a URDF, those of the upper triangle row by row.
 _AXES = ("xx", "xy", "xz", "yy", "yz", "zz")
 

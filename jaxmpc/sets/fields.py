@@ -65,12 +65,9 @@ def require_matching(
     shape = np.shape(as_array(H))
     if len(shape) != ndim or shape[-1] == 0:
         wanted = "(n,)" if ndim == 1 else "(rows, n)"
-        row = (
-            f"For one row write [{np.asarray(H).tolist()}]"
-            if len(shape) == 1 and concrete(H)
-            else ""
-        )
-        cure = row if row and ndim == 2 else f"Give an array {wanted}"
+        cure = f"Give an array {wanted}"
+        if ndim == 2 and len(shape) == 1 and concrete(H):
+            cure = f"For one row write [{np.asarray(H).tolist()}]"
         fail(f"{argument}.{first}", f"shape {shape} is not {wanted}", cure)
     require_dimension(argument, shape[-1], dimension)
     require_shape(f"{argument}.{second}", as_array(h), shape[:1], f"Match {first}")

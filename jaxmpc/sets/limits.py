@@ -190,11 +190,9 @@ def require_one_reading(argument: str, limit: Any, count: int) -> None:
         return
     a, b = (float(v) for v in limit)
     if a > 0 or b < 0:
-        c, d, low, high = abs(a), abs(b), min(a, b), max(a, b)
-        each, ends = (
-            f"([{-c:g}, {-d:g}], [{c:g}, {d:g}])",
-            f"([{low:g}, {low:g}], [{high:g}, {high:g}])",
-        )
+        each = f"([{-abs(a):g}, {-abs(b):g}], [{abs(a):g}, {abs(b):g}])"
+        low, high = sorted((a, b))
+        ends = f"([{low:g}, {low:g}], [{high:g}, {high:g}])"
         cure = f"Give {each} for one limit each, {ends} for lower and upper ends"
         fail(argument, f"[{a:g}, {b:g}] leaves out 0 as (lower, upper) of 2 coordinates", cure)
 

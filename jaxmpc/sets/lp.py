@@ -13,22 +13,24 @@ A number counts as zero if it is within the rounding of the terms that it is the
 import threading
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import highspy
 import numpy as np
 
 from jaxmpc.checks import fail
 
+# Entries of scaled rows that are smaller count as zeros: in HiGHS below 1e-9 unless told otherwise,
+# and this is the least that it takes.
+SMALL = 1e-12
 # Options of HiGHS: tolerances in rows and columns that are scaled to about 1. Its presolve calls
-# some unbounded programs infeasible and needs scaling of its own, so it is off. Entries below 1e-9
-# count as zeros unless told otherwise; 1e-12 is the least that it takes.
-HIGHS: dict[str, Any] = {
+# some unbounded programs infeasible and needs scaling of its own, so it is off.
+HIGHS = {
     "output_flag": False,
     "presolve": "off",
     "primal_feasibility_tolerance": 1e-10,
     "dual_feasibility_tolerance": 1e-10,
-    "small_matrix_value": 1e-12,
+    "small_matrix_value": SMALL,
 }
 METHODS = "simplex", "ipm"
 # By how much an answer of HiGHS may violate scaled rows, well above its tolerance.
@@ -217,14 +219,14 @@ class Program:
         limits = np.append(np.zeros(len(self.b)), np.ones(2 * n))
         equal = np.append(self.equal, np.zeros(2 * n, bool))
         model = Model(box, limits, equal)
+        # Rows of about 1 that let a point go 1e12 times as far as it typically does are no limits;
+        # HiGHS takes their entries for zeros.
+        M = np.where(np.abs(self.M) < SMALL, 0.0, self.M)
         for method in METHODS:
             found, _ = model.maximise(cost, method)
             if found is None:
                 continue
             r = np.where(np.abs(found[0]) < 1e-12, 0.0, found[0])
-            # Rows of about 1 that let a point go 1e12 times as far as it typically does are no
-            # limits; HiGHS takes their entries for zeros.
-            M = np.where(np.abs(self.M) < HIGHS["small_matrix_value"], 0.0, self.M)
             off, size = M @ r, np.abs(M) @ np.abs(r)
             off = np.where(self.equal, np.abs(off), off)
             if cost @ r > FLAT * np.abs(cost) @ np.abs(r) and np.all(off <= ROUNDING * size):

@@ -13,12 +13,7 @@ import optax
 from jaxmpc.arrays import Reals, numpy_array
 from jaxmpc.batches import chosen_devices
 from jaxmpc.checks import fail, nearest, whole
-from jaxmpc.closed_loop.simulation import (
-    Conditions,
-    Run,
-    initial_states,
-    require_variations,
-)
+from jaxmpc.closed_loop.simulation import Conditions, Run, initial_states, require_variations
 from jaxmpc.mpc.problem import MPC, harden
 from jaxmpc.mpc.stagewise.nonlinear import as_argument
 from jaxmpc.qp.admm import ADMM
