@@ -166,12 +166,12 @@ class FeasibilityProblem:
 
     def row_margins(self, exact: ExactData, size: np.ndarray) -> np.ndarray:
         """Return what margins (R,) of the rows a proof needs relative to each other: as rounding
-        can move them at points of this size (d,), within a factor of 1e8."""
+        can move them at points of this size (d,), within a factor of 1e9."""
         start = hard_constraints.start_sizes(self.view, size)
         rounding = hard_constraints.rounding_of_rows(exact, start)
         found = np.zeros(len(self.rows.lower) + 1)
         found[self.rows.index] = np.concatenate([np.ravel(part) for part in rounding])
-        return np.clip(found[:-1] * self.rows.weight, self.rows.size, 1e8 * self.rows.size)
+        return np.clip(found[:-1] * self.rows.weight, self.rows.size, 1e9 * self.rows.size)
 
 
 def described_policy(mpc: MPC) -> dict[str, Any]:

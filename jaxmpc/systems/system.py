@@ -53,8 +53,8 @@ class LinearSystem:
 
     In an `MPC` each of A, B and c may have a leading axis of N steps.
     A, B and c are pytree leaves (they may be batched and differentiated); the rest is
-    static. The constructor checks how shapes fit together, `validate` all, and takes a vector B
-    (n,) as one input; JAX rebuilds it without checks.
+    static. The constructor checks how shapes fit together, dt, names and units, and takes a vector
+    B (n,) as one input; `validate` checks the numbers too. JAX rebuilds it without checks.
     """
 
     A: Reals
@@ -69,6 +69,11 @@ class LinearSystem:
 
     def __post_init__(self) -> None:
         store_floats(self, "A", "B", "c")
+        if self.dt is not None:
+            require_period("dt", self.dt)
+        if not isinstance(self.time_unit, str) or not self.time_unit:
+            fail("time_unit", f"{self.time_unit!r} is no unit", 'Write it as "s", "min" or "h"')
+        require_printable("time_unit", self.time_unit)
         if dimensions(self.A) == 2 and dimensions(self.B) == 1:
             object.__setattr__(self, "B", as_column(self.B))
         if (dimensions(self.A) or 0) < 2 or (dimensions(self.B) or 0) < 2:
@@ -81,6 +86,12 @@ class LinearSystem:
         require_last("B", self.B, (n, self.m), "Give B as many rows as A")
         if dimensions(self.c):
             require_last("c", self.c, (n,), "Give one number a state, or None")
+        for kind, count in (("state", n), ("input", self.m)):
+            for what in (f"{kind}_names", f"{kind}_units"):
+                _require_strings(what, getattr(self, what), count)
+            names = getattr(self, f"{kind}_names")
+            if len(set(names)) < len(names):
+                fail(f"{kind}_names", f"{names} has a name twice", "Give each a name of its own")
 
     @property
     def n(self) -> int:
@@ -115,7 +126,7 @@ class LinearSystem:
         return after if self.c is None else after + jnp.asarray(self.c, x.dtype)
 
     def validate(self, steps: int | None = None) -> None:
-        """Raise ValueError for wrong shapes, non-finite entries, bad dt or bad names.
+        """Raise ValueError for wrong shapes and entries that are not finite.
 
         steps: A, B and c may have a leading axis of this length, as in an `MPC`; None: none has.
         """
@@ -138,17 +149,6 @@ class LinearSystem:
             outputs = "outputs are no part of a system: see jm.Outputs"
             cure = f"Give one number a state, or None; {outputs}"
             require_shape("c", self._at_one_step("c", 1, steps), (n,), cure)
-        if self.dt is not None:
-            require_period("dt", self.dt)
-        if not isinstance(self.time_unit, str) or not self.time_unit:
-            fail("time_unit", f"{self.time_unit!r} is no unit", 'Write it as "s", "min" or "h"')
-        require_printable("time_unit", self.time_unit)
-        for kind, count in (("state", n), ("input", m)):
-            for what in (f"{kind}_names", f"{kind}_units"):
-                _require_strings(what, getattr(self, what), count)
-            names = getattr(self, f"{kind}_names")
-            if len(set(names)) < len(names):
-                fail(f"{kind}_names", f"{names} has a name twice", "Give each a name of its own")
 
     def _at_one_step(self, name: str, axes: int, steps: int | None) -> Any:
         """Return A, B or c at the first step, or as it is where it has no more than these axes."""
