@@ -13,7 +13,7 @@ from jaxmpc.robots.couplings import Couplings
 from jaxmpc.robots.description import host_coordinates
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.mujoco_access import names, number_of
-from jaxmpc.robots.robot import Robot
+from jaxmpc.robots.robot import Robot, tool_of
 
 # Of each quantity, the field of MuJoCo's model that its factor multiplies and whose it is. The
 # order decides the random numbers: add at the end.
@@ -141,6 +141,8 @@ def _named(robot: Robot, ranges: Mapping[str, Any]) -> dict[str, tuple[str, np.n
         field, kind = QUANTITIES[quantity]
         size = 0 if field is None else len(getattr(robot.mujoco, field))
         places = np.arange(size)
+        if quantity == "payload":
+            tool_of(robot)
         if owner:
             places = _places(robot, name, owner[0], str(kind))
         found[name] = quantity, places

@@ -45,6 +45,11 @@ FLAT = 1e-12
 RELAX = "Relax a limit; with a terminal set enlarge that or lengthen the horizon"
 # What decides whether a state has a plan and may differ from step to step.
 HARD = ("system", "states", "inputs", "outputs", "input_rate_limit")
+# What makes the arguments that files may give by a name.
+MADE_BY = {
+    "terminal_cost": "jm.lqr(system, Q, R).P is that of LQR",
+    "terminal_set": "jm.sets.named_terminal_set makes the set of a name",
+}
 # How inputs answer to disturbances: see `MPC`.
 POLICIES = ("tightened", "tube", "affine")
 
@@ -268,6 +273,9 @@ class MPC:
         weights = ("Q", "R", "terminal_cost", "input_rate_weight", "stage_weights")
         store_floats(self, *weights, "prestabilise", "input_rate_limit")
         store_floats(self, "disturbance_matrix", "gain")
+        for name, cure in MADE_BY.items():
+            if isinstance(getattr(self, name), str):
+                fail(name, f"{getattr(self, name)!r} is text, which files alone know", cure)
         if dimensions(self.disturbance_matrix) == 1:
             object.__setattr__(self, "disturbance_matrix", as_column(self.disturbance_matrix))
         # JAX rebuilds this object with placeholders, and `in_axes` are one without arrays.

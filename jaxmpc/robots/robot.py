@@ -209,7 +209,7 @@ class Robot(RobotDescription):
         coordinates.
         """
         if target is not None:
-            return self.equilibrium(target)
+            return self.equilibrium(self.configurations("target", target))
         rest, texts = settled(self)
         for text in texts:
             warnings.warn(text, stacklevel=2)
@@ -300,11 +300,8 @@ class Robot(RobotDescription):
                 fail(key, "is zero for some joints of the file, which then have no such row", cure)
         varied = {**self.numbers, **numbers}
         if payload is not None:
-            site = number_of(self.mujoco, "site", "tool")
-            if site < 0:
-                fail("payload", "the model has no site named tool", "Add one where loads are held")
             require_shape("payload", payload, (), "Mass in kg")
-            varied |= with_payload(self.plant.mjx, varied, site, payload)
+            varied |= with_payload(self.plant.mjx, varied, tool_of(self), payload)
         return replace(self, numbers=varied)
 
 
@@ -344,6 +341,15 @@ class RobotModel:
         robot = self.robot
         x = jnp.asarray(robot.state(xi))
         return robot.predictor.data(x, u, self.numbers)
+
+
+def tool_of(robot: Robot) -> int:
+    """Return the number of the site "tool", which holds payloads. ValueError without one."""
+    site = number_of(robot.mujoco, "site", "tool")
+    if site < 0:
+        what = f"{robot.name} has no site named tool"
+        fail("payload", what, 'Add <site name="tool"/> to the body that holds loads')
+    return site
 
 
 def with_payload(

@@ -232,6 +232,9 @@ class BasicSet(ConvexSet):
     def __and__(self, other: Any) -> Any:
         return self.intersect(other)
 
+    def __or__(self, other: Any) -> Any:
+        raise TypeError("P | Q is no convex set. Write jm.sets.PolytopeUnion((P, Q))")
+
     def __neg__(self) -> Any:
         return self._times(-1.0)
 

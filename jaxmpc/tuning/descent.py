@@ -17,7 +17,7 @@ import optax
 from tqdm.std import tqdm
 
 from jaxmpc.batches import chosen_devices
-from jaxmpc.checks import fail, nearest, whole
+from jaxmpc.checks import fail, nearest, shown, whole
 from jaxmpc.files import fingerprint, read_arrays, remove_partial, write_arrays
 from jaxmpc.pytrees import record
 from jaxmpc.qp.linalg import float64_arrays
@@ -76,6 +76,9 @@ class Settings:
             whole("batch", self.batch, 1)
         if self.splits and not 0 < float(self.validation) < 1:
             fail("validation", f"{self.validation}", "Give a fraction in (0, 1), or samples")
+        if not isinstance(self.optimizer, optax.GradientTransformation | None):
+            cure = "Give one of optax, such as optax.adam(0.05)"
+            fail("optimizer", f"{shown(self.optimizer)} is no optimizer", cure)
 
     @property
     def splits(self) -> bool:

@@ -390,6 +390,8 @@ def test_sets_compare_with_sets_only_and_have_no_hash():
     assert square != Box([-1], [1])
     assert square == square.to_polytope() == Zonotope([0, 0], np.eye(2)) == -square
     assert square == square + [1e-12, 0] and square != square + [1e-6, 0]
+    with pytest.raises(TypeError, match="Write jm.sets.PolytopeUnion"):
+        square | square
     with pytest.raises(TypeError, match="unhashable"):
         hash(square)
 

@@ -95,6 +95,8 @@ def test_a_start_without_finite_loss_is_refused():
         bowl(-1)
     with pytest.raises(ValueError, match="optimizer.*gradient alone"):
         bowl(optimizer=optax.lbfgs())
+    with pytest.raises(ValueError, match="optimizer: 'adam' is no optimizer. Give one of optax"):
+        bowl(optimizer="adam")
 
 
 class Killed(BaseException):
