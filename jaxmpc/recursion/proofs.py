@@ -177,7 +177,10 @@ def _some_input(
     lost whatever the input, and the vertices of X_N that are lost.
     """
     none = np.zeros((0, plans.p))
-    later = projected(plans.followed(), deadline)
+    after = plans.followed()
+    if plans.exact and after.program.empty:
+        return every_input_leaves(body.center), body.polytope.volume(), body.vertices
+    later = projected(after, deadline)
     if isinstance(later, str):
         return Claim(None, f"of the states that can go on, {later}"), np.nan, none
     violation = later.beyond(body.vertices)

@@ -241,6 +241,19 @@ class TestProofs:
             ends = [float(exact_body.support(normal)) for normal in part.normals]
             np.testing.assert_allclose(part.offsets, ends, atol=1e-9)
 
+    @pytest.mark.parametrize("unit", [1.0, 1e-5])
+    def test_no_state_can_go_on(self, unit):
+        """x⁺ = x + u, 0 ≤ x ≤ 1.5, 1 ≤ u ≤ 2: X_1 = [0, 0.5], and every x⁺ ≥ 1."""
+        limits = jm.Box([0.0], [1.5 * unit])
+        mpc = jm.MPC(
+            jm.LinearSystem([[1.0]], [[1.0]]), np.eye(1), np.eye(1), 1,
+            states=limits, inputs=jm.Box([unit], [2 * unit]), terminal_set=limits,
+        )  # fmt: skip
+        found = jm.recursive_feasibility(mpc, np.array([[0.2 * unit]]), steps=1, search=False)
+        assert found.weak.holds is False and found.strong.holds is False
+        assert found.volume == pytest.approx(0.5 * unit)
+        assert found.lost_by_any == pytest.approx(0.5 * unit)
+
     @pytest.mark.slow
     def test_weak_where_sets_do_not_nest(self):
         """The first input must be that of a feasible plan: X_N against Pre(X_N ∩ X_{N−1})."""
