@@ -8,6 +8,7 @@ same combination of those of the centre and of its facet's vertices. Beyond a ha
 infeasible. The few points between get a ray of their own.
 """
 
+import contextlib
 import functools
 import math
 import time
@@ -204,11 +205,14 @@ class PolicyHull:
             )
         rays = PolicyRays.of(problem)
         bounds, left = close_gap(rays, gap, ROUNDS, MOST_RAYS, deadline)
-        try:
-            unit = np.ptp(bounds.points, axis=0)  # ValueError where there are no points
-            facets = hull_facets((bounds.points - rays.center) / unit)
-        except (QhullError, ValueError):
-            fail("mpc", "its feasible set is flat or unbounded: no hull of policies", "Bound it")
+        facets = None
+        if len(bounds.points) > d and len(bounds.offsets):  # else too few rays end, or half-spaces
+            unit = np.ptp(bounds.points, axis=0)
+            with contextlib.suppress(QhullError, ValueError), np.errstate(all="ignore"):
+                facets = hull_facets((bounds.points - rays.center) / unit)
+        if facets is None:
+            cure = "Bound the states, or use policy='tightened'"
+            fail("mpc", "its feasible set is flat or unbounded: no hull of policies", cure)
         theta, w = np.vstack([bounds.points, rays.center]), np.vstack([bounds.w, rays.w])
         facets = facets[np.linalg.cond(edges_of(theta, facets) / unit[:, None]) < 1e8]
         M = np.linalg.inv(edges_of(theta, facets))

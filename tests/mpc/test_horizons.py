@@ -104,9 +104,16 @@ def test_horizons_of_one_step(name, solve):
     jax.eval_shape(lambda x: jm.solve(mpc, x), np.array([0.3, 0.2]))
 
 
-def test_policies_without_limits_on_states_have_no_map():
-    system = jm.LinearSystem([[1.0, 0.1], [0.0, 1.0]], [[0.005], [0.1]], dt=0.1)
-    few = {"inputs": jm.Box(-1, 1), "disturbance": jm.Box([-0.01] * 2, [0.01] * 2)}
-    mpc = jm.MPC(system, np.eye(2), 1.0, 1, policy="tube", **few)
+SKEWED = jm.LinearSystem([[0.618, -0.889], [-0.048, 0.353]], [[0.654], [1.497]])
+
+
+@pytest.mark.parametrize("states", [None, jm.Box([-np.inf, -1.0], [1.0, 1.5])])
+@pytest.mark.parametrize("policy", ["affine", "tube"])
+def test_policies_of_unbounded_sets_have_no_map(policy, states):
+    """No ray ends, or no half-space holds on the whole set: one limit leaves a ray's end free."""
+    few = {"inputs": jm.Box(-1, 1), "disturbance": jm.Box([0.0, -0.1], [0.0, 0.1])}
+    mpc = jm.MPC(SKEWED, np.eye(2), 1.0, 2, states, policy=policy, constrain_initial=False, **few)
     with pytest.raises(ValueError, match="flat or unbounded: no hull of policies"):
         jm.map_feasible_set(mpc, np.zeros((2, 2)))
+    plain = replace(mpc, policy="tightened")  # the cure
+    assert jm.map_feasible_set(plain, np.zeros((2, 2))).label.tolist() == [1, 1]
