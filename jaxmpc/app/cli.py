@@ -1,5 +1,6 @@
 """The command `jaxmpc`: parse the command line, run the subcommand, and report how it ended."""
 
+import _thread
 import contextlib
 import importlib
 import inspect
@@ -10,6 +11,7 @@ import re
 import shlex
 import signal
 import sys
+import threading
 import time
 import types
 from collections.abc import Callable, Iterator, Sequence
@@ -154,7 +156,8 @@ def run(options: Any, argv: Sequence[str]) -> Outcome:
         command = command_of(options)
         if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # as in the background
             signal.signal(signal.SIGINT, signal.default_int_handler)
-        return command.run() or Outcome()
+        with no_interrupt_lost():
+            return command.run() or Outcome()
     except BrokenPipeError:
         return Outcome(without_reader())
     except (ValueError, OSError, MemoryError, ImportError) as error:
@@ -167,6 +170,26 @@ def run(options: Any, argv: Sequence[str]) -> Outcome:
         resume = shlex.join(["jaxmpc", *again, "--resume"])
         print(f"\nstopped; {options.keeps} that were done are kept. Go on with:\n  {resume}")
         return Outcome(130)
+
+
+@contextlib.contextmanager
+def no_interrupt_lost() -> Iterator[None]:
+    """Interrupt once more where Ctrl-C fell into a callback, of which Python ignores exceptions:
+    JAX has one at each garbage collection."""
+    usual = sys.unraisablehook
+
+    def hook(ignored: Any) -> None:
+        if issubclass(ignored.exc_type, KeyboardInterrupt):
+            # Later: an exception in here would be ignored too.
+            threading.Timer(0.01, _thread.interrupt_main).start()
+        else:
+            usual(ignored)
+
+    sys.unraisablehook = hook
+    try:
+        yield
+    finally:
+        sys.unraisablehook = usual
 
 
 def command_of(options: Any) -> Any:

@@ -3,7 +3,6 @@
 First a `View`: which initial states a point stands for. Then `ExactData`, and what it is made of.
 """
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple, TypeAlias
@@ -202,6 +201,8 @@ class Equalities:
         X = E⁺ and η = ‖ |I − E X| + e|X| ‖ < 1 in the maximum norm, exactly E X is invertible, and
         X (E X)⁻¹ r is an exact change, no larger than |X| ‖r‖ / (1 − η).
         """
+        if not (np.any(p.lower == p.upper) or np.any(p.lower_N == p.upper_N)):
+            return None
         (n, m), N = p.sizes, p.horizon
         moves = np.equal.outer(np.array(p.moves), np.arange(max(p.moves) + 1)).astype(float)
         first = np.unique(p.moves, return_index=True)[1]
@@ -354,9 +355,9 @@ def exact_data(
         far = (bound > grown) | np.isinf(bound)
         left[k], sides[k], reach[k] = far, np.where(far, 0.0, side), np.where(far, 0.0, bound)
         grown = np.minimum(grown, bound)
-    x_size = [largest_magnitude(*limit[:, :n]) for limit in limits]
-    ends = zip(*(v[:, :n] for v in each_step), itertools.pairwise(x_size), strict=True)
-    implied = np.array([input_size(A_k[:, :n], B_k, c_k, *two) for A_k, B_k, c_k, two in ends])
+    sizes = np.array([largest_magnitude(*limit[:, :n]) for limit in limits])
+    A_x, B_x, c_x = (v[:, :n] for v in each_step)
+    implied = input_sizes(A_x[..., :n], B_x, c_x, sizes)
     same_move = [np.equal(mpc.moves, i) for i in range(max(mpc.moves) + 1)]
     implied = np.array([implied[same].min(axis=0) for same in same_move])
     widest = blocks if widest is None else widest
@@ -478,23 +479,20 @@ def around(limits: Any) -> Any:
     return Box(ends[:, 0].min(axis=0), ends[:, 1].max(axis=0))
 
 
-def input_size(
-    A: np.ndarray, B: np.ndarray, c: np.ndarray, before: np.ndarray, after: np.ndarray
-) -> np.ndarray:
-    """Return bounds (m,) of |u_k| from those of |x_k| and |x_{k+1}|, by u_k = B⁺(x_{k+1} − A x_k −
-    c).
+def input_sizes(A: np.ndarray, B: np.ndarray, c: np.ndarray, states: np.ndarray) -> np.ndarray:
+    """Return bounds (N, m) of |u_k| from those of |x_k|, states (N+1, n), by u_k = B⁺(x_{k+1} − A
+    x_k − c); A, B and c have a leading axis of N.
 
     ∞ where there is none, and where B has dependent columns.
     """
-    M, (n, m) = np.linalg.pinv(B), B.shape
+    M, (n, m) = np.linalg.pinv(B), B.shape[1:]
     off = np.abs(M @ B - np.eye(m)) + n * 1e-15 * np.abs(M) @ np.abs(B)
-    if off.max() > 1e-8:
-        return np.full(m, np.inf)
     with np.errstate(invalid="ignore"):  # 0·inf below counts as 0
-        terms = after + np.nansum(np.abs(A) * before, axis=1) + np.abs(c)
-        bound = np.nansum(np.abs(M) * terms, axis=1)
+        terms = states[1:] + np.nansum(np.abs(A) * states[:-1, None], axis=2) + np.abs(c)
+        bound = np.nansum(np.abs(M) * terms[:, None], axis=2)
     # B⁺B is the unit matrix to 1e-8, and sums are rounded.
-    return bound + 1e-6 * bound.max()
+    bound = bound + 1e-6 * bound.max(axis=1, keepdims=True)
+    return np.where(off.max(axis=(1, 2))[:, None] > 1e-8, np.inf, bound)
 
 
 def one_sided(lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

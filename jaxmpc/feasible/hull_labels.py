@@ -175,12 +175,10 @@ def vertex_values(
     p: ExactData, rows: ConstraintRows, theta: np.ndarray, w: np.ndarray, free: int
 ) -> np.ndarray:
     """Return the inputs (K, N·m), within their limits, and the `free` states that w (K, k) stand
-    for at θ (K, d), side by side."""
+    for at θ (K, d), side by side. All are arrays of NumPy."""
     variables = w @ rows.back.T
     inputs = np.tensordot(theta, rows.Psi, (1, 2)) + np.tensordot(variables, rows.Omega, (1, 2))
-    inputs = inputs + rows.psi
-    with jax.enable_x64(True):
-        inputs = np.asarray(jax.vmap(functools.partial(proofs.within_limits, p))(inputs))
+    inputs = proofs.within_limits(p, inputs + rows.psi)
     return np.hstack([inputs.reshape(len(w), -1), variables[:, variables.shape[1] - free :]])
 
 

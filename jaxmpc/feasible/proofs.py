@@ -42,7 +42,7 @@ whole set, (a + s∘w)'θ ≤ b + w'reach_0, if limits on x_0, or twice the exte
 both directions along a facet there is none: the facet's normal is no vector of floats.)
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -51,7 +51,7 @@ from jax import Array
 
 from jaxmpc.feasible.hard_constraints import ExactData
 from jaxmpc.pytrees import pytree
-from jaxmpc.qp.linalg import by_step
+from jaxmpc.qp.linalg import by_step, namespace
 
 UNIT_ROUNDOFF = 2.0**-53
 # Covers products that underflow; data smaller than this count as zero.
@@ -120,9 +120,11 @@ def prove_feasible(p: ExactData, theta: Array, free: Array, inputs: Array) -> tu
     return (slack >= 0) & jnp.all(within), inputs
 
 
-def within_limits(p: ExactData, inputs: Array) -> Array:
-    """Return inputs (N, m) clipped into their limits, those of one move equal to its first."""
-    return jnp.clip(inputs, p.u_lower, p.u_upper)[first_of_block(p.moves)]
+def within_limits(p: ExactData, inputs: Any) -> Any:
+    """Return inputs (..., N, m) clipped into their limits, those of one move equal to its first;
+    arrays of NumPy as such."""
+    xp = namespace(inputs)
+    return xp.clip(inputs, p.u_lower, p.u_upper)[..., first_of_block(p.moves), :]
 
 
 def roll_out(p: ExactData, x: Array, inputs: Array, moved: Array) -> tuple[Array, Array, Array]:

@@ -119,7 +119,7 @@ def float64_arrays(tree: T) -> T:
 def on_device(tree: T) -> T:
     """Return arrays of NumPy as arrays of JAX whose memory is their own. (`jnp.array` compiles a
     program for each shape, in JAX 0.12.)"""
-    return jax.tree.map(lambda v: jax.device_put(np.array(v)), tree)
+    return jax.device_put(jax.tree.map(np.array, tree))
 
 
 def floating_dtype(tree: Any) -> jnp.dtype:

@@ -1,5 +1,6 @@
 """The command: files and table when all is well, one line and an exit code when not."""
 
+import gc
 import io
 import json
 import os
@@ -474,6 +475,27 @@ def test_ctrl_c_is_one_line_from_the_first_import_on(options, sign, answer):
         out, err = process.communicate()
     assert (process.returncode, out) == (130, answer)
     assert "Traceback" not in err
+
+
+@pytest.mark.usefixtures("interruptible")
+def test_ctrl_c_in_a_callback_is_not_lost(capsys):
+    """Python ignores what callbacks of the garbage collector raise, such as JAX's."""
+    seen = []
+
+    def callback(*_):
+        if not seen:
+            seen.append(True)
+            signal.raise_signal(signal.SIGINT)
+
+    gc.callbacks.append(callback)
+    try:
+        with pytest.raises(KeyboardInterrupt), cli.no_interrupt_lost():
+            gc.collect()
+            for _ in range(500):
+                time.sleep(0.01)
+    finally:
+        gc.callbacks.remove(callback)
+    assert seen and not capsys.readouterr().err
 
 
 def test_init_writes_a_problem_that_every_command_reads(capsys):
