@@ -233,7 +233,8 @@ class BasicSet(ConvexSet):
         return self.intersect(other)
 
     def __or__(self, other: Any) -> Any:
-        raise TypeError("P | Q is no convex set. Write jm.sets.PolytopeUnion((P, Q))")
+        cure = "Write jm.sets.PolytopeUnion((P.to_polytope(), Q.to_polytope()))"
+        raise TypeError(f"P | Q is no convex set. {cure}")
 
     def __neg__(self) -> Any:
         return self._times(-1.0)

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from jaxmpc import Box, Ellipsoid, Polytope
-from jaxmpc.sets import Zonotope, set_difference
+from jaxmpc.sets import PolytopeUnion, Zonotope, set_difference
 
 # Intervals (lower, upper) of each coordinate.
 SHAPES = {
@@ -390,8 +390,12 @@ def test_sets_compare_with_sets_only_and_have_no_hash():
     assert square != Box([-1], [1])
     assert square == square.to_polytope() == Zonotope([0, 0], np.eye(2)) == -square
     assert square == square + [1e-12, 0] and square != square + [1e-6, 0]
-    with pytest.raises(TypeError, match="Write jm.sets.PolytopeUnion"):
+    with pytest.raises(
+        TypeError, match=r"PolytopeUnion\(\(P.to_polytope\(\), Q.to_polytope\(\)\)\)"
+    ):
         square | square
+    parts = (square.to_polytope(), (square + [3, 0]).to_polytope())  # the cure
+    assert PolytopeUnion(parts).volume() == pytest.approx(8)
     with pytest.raises(TypeError, match="unhashable"):
         hash(square)
 
