@@ -86,7 +86,7 @@ def robot_mpc(
         for text in texts:
             warnings.warn(text, stacklevel=2)
     else:
-        x, u = robot.equilibrium(target)
+        x, u = robot.set_point(target)
     names = robot.state_names or tuple(f"coordinate {i}" for i in range(robot.n))
     states = _around(robot.state_limits, margin, host_coordinates(robot, x), names)
     with jax.enable_x64(True):

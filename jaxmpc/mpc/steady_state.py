@@ -22,6 +22,7 @@ from jaxmpc.qp.problem import QP, Bounds
 from jaxmpc.qp.residuals import with_fault
 from jaxmpc.qp.solve import solve_factored
 from jaxmpc.sets.convex_sets import Box
+from jaxmpc.sets.lp import scaling
 from jaxmpc.systems.riccati import balanced
 from jaxmpc.systems.system import LinearSystem, host_matrices
 
@@ -50,8 +51,8 @@ def equilibrium(
     Give x and u to `solve` as reference and input_reference, so that the cost vanishes there.
 
     Raises ValueError where no equilibrium meets the target, within the limits if there are any: the
-    message says how far the closest one stays from it. NumPy in float64; not traceable; residual
-    below 1e-11 + 1e-9 times the size of its terms.
+    message says how far the closest one stays from it. NumPy in float64; not traceable; the
+    residual of each row is below 1e-9 times the size of its terms, in any units.
     """
     if not isinstance(system, LinearSystem):
         fail("system", f"is a {type(system).__name__}", "Give a jm.LinearSystem")
@@ -65,7 +66,7 @@ def equilibrium(
     target = host_array("target", target)
     require_finite("target", target)
     A, B, c = host_matrices(system)
-    M = np.block([[np.eye(n) - A, -B], [C, np.zeros((len(C), m))]])
+    M = np.vstack([_steady_rows(A, B), np.hstack([C, np.zeros((len(C), m))])])
     value = np.concatenate([c, target])
     low, high = np.full(n + m, -np.inf), np.full(n + m, np.inf)
     for set_, part, name, size in (
@@ -77,23 +78,46 @@ def equilibrium(
                 fail(name, f"is a {type(set_).__name__}", "Give a Box, or None")
             set_.validate(name, size)
             low[part], high[part] = np.asarray(set_.lower, float), np.asarray(set_.upper, float)
-    found = np.linalg.lstsq(M, value, rcond=None)[0]
+    # In units in which all numbers are about 1: none of the user's decide what is an equilibrium.
+    every = np.vstack([M, np.eye(n + m), np.eye(n + m)])
+    row, column = scaling(every, np.concatenate([value, low, high]))
+    row = row[: len(M)]
+    rows, sides = row[:, None] * M * column, row * value
+    z, _, rank, _ = np.linalg.lstsq(rows, sides, rcond=1e-12)
+    free = column[:, None] * np.linalg.svd(rows)[2][rank:].T
+    found = column * z
+    found = found - free @ np.linalg.lstsq(free, found, rcond=None)[0]
     if not np.all((low <= found) & (found <= high)):
-        # bvls: an active-set method, exact up to rounding. Fixed entries are its open case.
-        width = np.where(high > low, 0.0, 1e-12 * (1 + np.abs(high)))
-        found = scipy.optimize.lsq_linear(
-            M, value, (low - width, high + width), method="bvls", tol=1e-15
-        ).x
-        found = np.clip(found, low, high)
+        open_, found = low < high, low.copy()
+        if np.any(open_):
+            # bvls: an active-set method, exact up to rounding.
+            sides = sides - rows[:, ~open_] @ (low / column)[~open_]
+            ends = (low / column)[open_], (high / column)[open_]
+            z = scipy.optimize.lsq_linear(rows[:, open_], sides, ends, method="bvls", tol=1e-15).x
+            found[open_] = np.clip(column[open_] * z, low[open_], high[open_])
+    for _ in range(2):  # where units are far apart, rounding of large entries moves small ones
+        inside = (low < found) & (found < high)
+        left = row * (value - M @ found)
+        moved = column[inside] * np.linalg.lstsq(rows[:, inside], left, rcond=1e-12)[0]
+        found[inside] = np.clip(found[inside] + moved, low[inside], high[inside])
     error = M @ found - value
     size = np.abs(M) @ np.abs(found) + np.abs(value)
-    if not np.all(np.abs(error) <= 1e-11 + 1e-9 * size):
+    # Sums of zeros are off by rounding of the largest numbers.
+    rounding = 1e-14 * np.max(np.append(np.abs(found) / column, np.abs(row * value))) / row
+    if not np.all(np.abs(error) <= rounding + 1e-9 * size):
         closest = C @ found[:n]
         drift = np.abs(error[:n]).max()
         away = f"the closest has outputs {closest} and drifts by {drift:.3g} a step"
         what = f"{target} is held by no equilibrium ({away})"
         fail("target", what, "Choose another target or widen the limits")
     return found[:n], found[n:]
+
+
+def _steady_rows(A: np.ndarray, B: np.ndarray) -> np.ndarray:
+    """Return [I − A, −B]; a diagonal of A that differs from 1 by rounding counts as 1."""
+    stays = np.eye(len(A)) - A
+    stays[np.abs(stays) <= 4 * np.finfo(float).eps * np.eye(len(A))] = 0.0
+    return np.hstack([stays, -B])
 
 
 @named_pytree
@@ -140,7 +164,7 @@ class SteadyStates:
         mpc.require_constant("a steady state has one for all", *HARD, "soft")
         A, B, c = host_matrices(system)
         n, m = B.shape
-        M = np.hstack([np.eye(n) - A, -B])
+        M = _steady_rows(A, B)
         row, column = balanced(M)
         left, values, right = np.linalg.svd(row[:, None] * M * column)
         if values[-1] <= FLAT * values[0]:

@@ -19,8 +19,10 @@ from jaxmpc.robots.description import RobotDescription
 from jaxmpc.robots.mujoco_access import flag, mujoco, name_of, single_joints
 from jaxmpc.sets.convex_sets import Box
 
-# Forces that count as balanced, relative to 1 + the largest one.
+# Forces that count as balanced, relative to `Forces.sizes`.
 BALANCED = 1e-6
+# Of the largest of these sizes: below it rounding of the large forces decides.
+_LEAST = 1e-6
 # Accelerations (rad/s², m/s²) that count as rest.
 AT_REST = 1e-3
 # Weights of the distance in the search, one after the other; the last leaves balanced forces.
@@ -39,8 +41,7 @@ class Rest:
     """A robot at rest in q (nq,) under u (m,) with activation states act (na,).
 
     drive (m,): what holds it, the input or the activation of each actuator, and lower, upper (m,)
-    its limits. missing (nv,): generalised forces that nothing balances. size: 1 + the largest force
-    there without inputs.
+    its limits. missing (nv,): generalised forces that nothing balances. sizes (nv,): of the forces.
     """
 
     q: np.ndarray
@@ -50,7 +51,7 @@ class Rest:
     lower: np.ndarray
     upper: np.ndarray
     missing: np.ndarray
-    size: float
+    sizes: np.ndarray
 
     @property
     def x(self) -> np.ndarray:
@@ -59,18 +60,28 @@ class Rest:
 
     @property
     def over(self) -> np.ndarray:
-        """Return how far the drive is beyond its limits, (m,); not above 0 inside."""
-        return np.maximum(self.lower - self.drive, self.drive - self.upper)
+        """Return how far the drive is beyond its limits, (m,); 0 inside, and where rounding takes
+        it beyond."""
+        over = np.maximum(self.lower - self.drive, self.drive - self.upper)
+        ends = np.abs([self.lower, self.upper])
+        size = np.where(np.isfinite(ends), ends, 0.0).max(axis=0)
+        rounding = 1e-9 * size + 1e-12 * np.abs(self.drive).max(initial=0.0)
+        return np.where(over > rounding, over, 0.0)
 
     @property
     def balanced(self) -> bool:
         """Return whether the forces balance, limits aside."""
-        return bool(np.all(np.abs(self.missing) <= BALANCED * self.size))
+        return self.lacks <= BALANCED
+
+    @property
+    def lacks(self) -> float:
+        """Return the largest force that is missing, in sizes."""
+        return float(np.max(np.abs(self.missing) / self.sizes, initial=0.0))
 
     @property
     def held(self) -> bool:
         """Return whether inputs within the limits balance the forces."""
-        return self.balanced and bool(np.all(self.over <= 1e-9))
+        return self.balanced and not np.any(self.over)
 
 
 class Forces:
@@ -113,6 +124,20 @@ class Forces:
             self.data.act = act
         mujoco.mj_forward(self.model, self.data)
         return self.uncoupled(self.data.qfrc_smooth)
+
+    def sizes(self, f: np.ndarray) -> np.ndarray:
+        """Return the sizes (nv,) of the forces at the position in `data`: of f (nv,), those there
+        without inputs, and of those that give each coordinate alone the acceleration of gravity.
+
+        So a robot of milligrams is measured as one of tons is, and a finger as its arm.
+        """
+        inertia, gravity = np.zeros_like(f), np.linalg.norm(self.model.opt.gravity)
+        for i, axis in enumerate(np.eye(len(f))):
+            column = np.zeros_like(f)
+            mujoco.mj_mulM(self.model, self.data, column, axis)
+            inertia[i] = column[i]
+        sizes = np.abs(f) + (1 + gravity) * inertia
+        return np.maximum(sizes, _LEAST * sizes.max(initial=0.0))
 
     def uncoupled(self, force: np.ndarray) -> np.ndarray:
         """Return the part (nv,) of generalised forces, at the position in `data`, that couplings do
@@ -158,15 +183,16 @@ class Forces:
 
     def rest(self, q: np.ndarray, drive: np.ndarray, f: np.ndarray) -> Rest:
         """Return the rest at q under a drive; f (nv,), the forces without any."""
-        size, missing = 1 + float(np.abs(f).max()), self.at(q, drive)
-        if self.couplings.there and np.all(np.abs(missing) <= BALANCED * size):
+        missing = self.at(q, drive)
+        sizes = self.sizes(f)
+        if self.couplings.there and np.all(np.abs(missing) <= BALANCED * sizes):
             # Where couplings are too soft for Newton's method, the configuration stays as given.
             for place in ((q, drive), self.settled(q, drive)):
                 self.at(*place)
                 left = self.data.qfrc_smooth + self.data.qfrc_constraint
-                if place[0] is q or np.all(np.abs(left) <= BALANCED * size):
+                if place[0] is q or np.all(np.abs(left) <= BALANCED * sizes):
                     (q, drive), missing = place, left
-        return Rest(q, *self.parts(drive), drive, self.lower, self.upper, missing, size)
+        return Rest(q, *self.parts(drive), drive, self.lower, self.upper, missing, sizes)
 
 
 def rest_at(robot: RobotDescription, q: np.ndarray, *, within: bool = False) -> Rest:
@@ -199,7 +225,8 @@ def _standing(forces: Forces, feet: Feet, q: np.ndarray) -> Rest:
     cones, and the balance has a large weight (Lawson & Hanson, ch. 22)."""
     J, f = forces.affine(q)
     G, R = feet.jacobian(forces.model, forces.data), feet.edges()
-    size = 1 + float(np.abs(f).max())
+    sizes = forces.sizes(f)
+    size = float(np.abs(f).max()) or float(sizes.max())
     width = np.minimum((forces.upper - forces.lower) / 2, size)
     on_feet = np.sqrt(np.tile([_NORMAL, 1.0, 1.0], len(feet))) * len(feet) / size
     balance = _BALANCE / size
@@ -215,7 +242,7 @@ def _standing(forces: Forces, feet: Feet, q: np.ndarray) -> Rest:
     found = scipy.optimize.lsq_linear(rows, aim, (lower, upper), method="bvls", tol=1e-15)
     drive, r = np.split(found.x, [forces.m])
     missing = forces.at(q, drive) + G.T @ (R @ r)
-    return Rest(q, *forces.parts(drive), drive, forces.lower, forces.upper, missing, size)
+    return Rest(q, *forces.parts(drive), drive, forces.lower, forces.upper, missing, sizes)
 
 
 # What takes a rest away: the constraints, see `mujoco_access.flag`, or "" for limits of forces; in
@@ -381,21 +408,21 @@ def lacking(robot: RobotDescription, rest: Rest) -> str:
         i = int(np.argmax(rest.over))
         return f"{robot.input_names[i]} is {rest.over[i]:.3g} beyond its limit"
     missing = np.abs(rest.missing)
-    dof = int(np.argmax(missing))
+    dof = int(np.argmax(missing / rest.sizes))
     return f"{missing[dof]:.3g} are missing at {robot.state_names[dof]}"
 
 
 @record
 class Neighbourhood:
-    """Rests near a configuration q (nq,), as z = (motion from q (nv,), drive (m,)).
+    """Rests near a configuration q (nq,), as z = (motion from q (nv,), drive in units (m,)).
 
-    size: of the forces. width (m,): of the drives.
+    sizes (nv,): of the forces. unit (m,): of the drives.
     """
 
     forces: Forces
     q: np.ndarray
-    size: float
-    width: np.ndarray
+    sizes: np.ndarray
+    unit: np.ndarray
 
     def position(self, z: np.ndarray) -> np.ndarray:
         """Return the configuration (nq,)."""
@@ -403,13 +430,13 @@ class Neighbourhood:
         mujoco.mj_integratePos(self.forces.model, position, z[:nv], 1.0)
         return position
 
-    def force(self, z: np.ndarray) -> np.ndarray:
-        """Return the sum (nv,) of all forces."""
-        return self.forces.at(self.position(z), z[self.forces.model.nv :])
+    def drive(self, z: np.ndarray) -> np.ndarray:
+        """Return the drive (m,)."""
+        return self.unit * z[self.forces.model.nv :]
 
     def balance(self, z: np.ndarray) -> np.ndarray:
-        """Return the sum of forces over their size, and how far couplings are from being met."""
-        force = self.force(z) / self.size
+        """Return the sum of forces over their sizes, and how far couplings are from being met."""
+        force = self.forces.at(self.position(z), self.drive(z)) / self.sizes
         couplings = self.forces.couplings
         return np.append(force, couplings.rows(self.position(z))[0]) if couplings.there else force
 
@@ -417,7 +444,7 @@ class Neighbourhood:
         """Return the roots of the weights of z. Drives weigh next to nothing: of many that hold q,
         a small one."""
         root = np.sqrt(weight)
-        return np.append(np.full(self.forces.model.nv, root), 1e-3 * root / self.width)
+        return np.append(np.full(self.forces.model.nv, root), np.full(len(self.unit), 1e-3 * root))
 
     def residual(self, z: np.ndarray, weight: float) -> np.ndarray:
         """Return what is to be small, in the sum of its squares."""
@@ -427,7 +454,7 @@ class Neighbourhood:
         """Return the derivative of `residual`, by central differences in the motion."""
         steps = _STEP * np.eye(len(z))[: self.forces.model.nv]
         by_motion = [(self.balance(z + e) - self.balance(z - e)) / (2 * _STEP) for e in steps]
-        by_drive = self.forces.affine(self.position(z))[0] / self.size
+        by_drive = self.forces.affine(self.position(z))[0] * self.unit / self.sizes[:, None]
         unmoved = np.zeros((len(by_motion[0]) - len(by_drive), by_drive.shape[1]))
         top = np.hstack([np.array(by_motion).T, np.vstack([by_drive, unmoved])])
         return np.vstack([top, np.diag(self.scales(weight))])
@@ -440,7 +467,7 @@ def nearest_rest(robot: RobotDescription, q: np.ndarray) -> Rest:
     Minimises |forces|² + w |motion|² over motions from q inside the position limits and drives
     inside theirs, for weights w that fall to almost nothing: a local search, whose end is a local
     minimum of the distance, or of forces that nothing balances. Then it begins again, nearer and
-    nearer to home. Forces are scaled by the largest one at q, motions by rad or m.
+    nearer to home. Forces are scaled by their sizes at q, motions by rad or m.
     """
     forces, home = Forces(robot), np.zeros(robot.predictor.model.nv)
     mujoco.mj_differentiatePos(forces.model, home, 1.0, q, robot.home[: len(q)])
@@ -449,38 +476,39 @@ def nearest_rest(robot: RobotDescription, q: np.ndarray) -> Rest:
         rests.append(_searched(robot, forces, q, share * home))
         if rests[-1].held or not home.any():
             break
-    return min(rests, key=lambda rest: (not rest.held, float(np.abs(rest.missing).max())))
+    return min(rests, key=lambda rest: (not rest.held, rest.lacks))
 
 
 def _searched(robot: RobotDescription, forces: Forces, q: np.ndarray, motion: np.ndarray) -> Rest:
     """Return where the search of `nearest_rest` ends that begins at a motion (nv,) from q (nq,)."""
-    size = 1 + float(np.abs(forces.affine(q)[1]).max())
+    sizes = forces.sizes(forces.affine(q)[1])
     start = q.copy()
     mujoco.mj_integratePos(forces.model, start, motion, 1.0)
     J, f = forces.affine(start)
     drive = np.linalg.lstsq(J, -f, rcond=None)[0]
+    half = (forces.upper - forces.lower) / 2
+    unit = np.maximum(np.where(half > 0, np.minimum(1.0, half), 1.0), np.abs(drive))
+    near = Neighbourhood(forces, q, sizes, unit)
     low, high = _room(forces.model, robot.state_limits, q)
-    lower, upper = np.append(low, forces.lower), np.append(high, forces.upper)
+    lower, upper = np.append(low, forces.lower / unit), np.append(high, forces.upper / unit)
     narrow = 1e-9 * (upper - lower < 1e-9)
     lower, upper = lower - narrow, upper + narrow
     width = upper - lower
-    inset = np.where(np.isfinite(width), 1e-10 * np.where(np.isfinite(width), width, 0), 1e-10)
-    near = Neighbourhood(forces, q, size, np.maximum(1.0, np.abs(drive)))
-    z = np.clip(np.append(motion, drive), lower + inset, upper - inset)
+    inset = 1e-10 * np.where(np.isfinite(width), width, 1.0)
+    z = np.clip(np.append(motion, drive / unit), lower + inset, upper - inset)
     tight = {"xtol": 1e-14, "ftol": 1e-14, "gtol": 1e-14, "max_nfev": 50}
-    scale = np.append(np.ones(len(low)), near.width)
     for weight in _WEIGHTS:
-        options = {"args": (weight,), "bounds": (lower, upper), "x_scale": scale, **tight}
+        options = {"args": (weight,), "bounds": (lower, upper), **tight}
         found = scipy.optimize.least_squares(near.residual, z, near.jacobian, **options)
         z = np.clip(found.x, lower + inset, upper - inset)
     position = near.position(z)
     J, f = forces.affine(position)
-    drive = np.clip(z[len(low) :], forces.lower, forces.upper)
+    drive = np.clip(near.drive(z), forces.lower, forces.upper)
     # The search leaves rounding; what it found is the balance of its neighbourhood.
     better = drive - np.linalg.lstsq(J, J @ drive + f, rcond=None)[0]
     drives = (drive, np.clip(better, forces.lower, forces.upper))
     rests = [forces.rest(position, v, f) for v in drives]
-    return min(rests, key=lambda rest: float(np.abs(rest.missing).max()))
+    return min(rests, key=lambda rest: rest.lacks)
 
 
 def _room(model: "mujoco.MjModel", limits: Box, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -495,12 +523,13 @@ def _room(model: "mujoco.MjModel", limits: Box, q: np.ndarray) -> tuple[np.ndarr
 
 def inverse_actuation(
     robot: RobotDescription, q: np.ndarray, v: np.ndarray, a: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return the inputs u (m,) that give the accelerations a (nv,) at q (nq,), v (nv,), the sizes
-    (nv,) of the forces that they lack, and 1 + the largest force that is needed."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the inputs u (m,) that give the accelerations a (nv,) at q (nq,), v (nv,), and the
+    forces (nv,) that they lack, 0 where it is rounding."""
     forces, inertial = Forces(robot), np.zeros(len(a))
     J, f = forces.affine(q, v)
     mujoco.mj_mulM(forces.model, forces.data, inertial, a)
     needed = forces.uncoupled(inertial) - f
     u = np.linalg.lstsq(J, needed, rcond=None)[0]
-    return u, np.abs(J @ u - needed), 1 + np.abs(needed).max()
+    missing = np.abs(J @ u - needed)
+    return u, np.where(missing > BALANCED * forces.sizes(needed), missing, 0.0)

@@ -167,27 +167,33 @@ class Robot(RobotDescription):
                 fail("near", missing + lacking(self, rest), cure)
             require_rest("near", self, [rest])
             return rest.x, rest.u
-        q = self.configurations("q", self.home[: self.mujoco.nq] if q is None else q)
-        self._require_coupled(q)
+        return self._equilibria("q", self.home[: self.mujoco.nq] if q is None else q)
+
+    def _equilibria(self, argument: str, q: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Return (x, u) of the robot at rest in q (..., nq), as `equilibrium`; errors name the
+        argument that gave q."""
+        q = self.configurations(argument, q)
+        self._require_coupled(argument, q)
         rests = [rest_at(self, row) for row in q.reshape(-1, q.shape[-1])]
-        cure = "Choose a configuration that the actuators hold, or search for one: near=q without q"
-        if stands:
+        cure = "Choose a configuration that the actuators hold, or search for one: "
+        cure += "robot.equilibrium(near=q)"
+        if hasattr(self.predictor, "feet"):
             cure = "Choose another configuration, or give more torque, or feet with more friction"
         for rest in rests:
             if not rest.balanced:
                 missing = f"no input balances the forces; {lacking(self, rest)}"
-                fail("q", f"{rest.q}: {missing}", cure)
+                fail(argument, f"{rest.q}: {missing}", cure)
         over = np.array([rest.over for rest in rests])
-        if np.any(over > 1e-9):
+        if np.any(over):
             i = int(np.argmax(over.max(axis=0)))
             needed = np.array([rest.drive[i] for rest in rests])
             limits = f"the limits are [{rests[0].lower[i]:g}, {rests[0].upper[i]:g}]"
-            fail("q", f"needs {self.input_names[i]} = {needed}, {limits}", cure)
-        require_rest("q", self, rests)
+            fail(argument, f"needs {self.input_names[i]} = {needed}, {limits}", cure)
+        require_rest(argument, self, rests)
         x, u = (np.array([getattr(rest, name) for rest in rests]) for name in ("x", "u"))
         return x.reshape(*q.shape[:-1], self.state_size), u.reshape(*q.shape[:-1], self.m)
 
-    def _require_coupled(self, q: np.ndarray) -> None:
+    def _require_coupled(self, argument: str, q: np.ndarray) -> None:
         """Raise ValueError where configurations (..., nq) violate couplings of the file."""
         couplings = Couplings(self.predictor.model)
         for row in q.reshape(-1, q.shape[-1]):
@@ -196,7 +202,7 @@ class Robot(RobotDescription):
                 cure = f"The nearest configuration that meets them: {nearest}"
                 if couplings.unmet(nearest):
                     cure = "No configuration near it meets them: start elsewhere, or mend the file"
-                fail("q", f"{row} violates couplings (equalities) of the file: {off}", cure)
+                fail(argument, f"{row} violates couplings (equalities) of the file: {off}", cure)
 
     def set_point(self, target: Any = None) -> tuple[np.ndarray, np.ndarray]:
         """Return (x, u), the state and the input about which `robot_mpc` takes its model.
@@ -209,7 +215,7 @@ class Robot(RobotDescription):
         coordinates.
         """
         if target is not None:
-            return self.equilibrium(self.configurations("target", target))
+            return self._equilibria("target", target)
         rest, texts = settled(self)
         for text in texts:
             warnings.warn(text, stacklevel=2)
@@ -235,8 +241,8 @@ class Robot(RobotDescription):
             motions.append(host_array(argument, value).reshape(-1, nv))
         found = []
         for row in zip(*motions, strict=True):
-            u, missing, size = inverse_actuation(self, *row)
-            if np.any(missing > 1e-6 * size):
+            u, missing = inverse_actuation(self, *row)
+            if np.any(missing):
                 place = f"at {self.state_names[int(np.argmax(missing))]}"
                 problem = f"no input balances the forces; {missing.max():.3g} are missing {place}"
                 fail("q", f"{row[0]}: {problem}", "Choose a motion that the actuators can make")

@@ -306,8 +306,9 @@ class StoredPolicies:
         margin = np.minimum(self.margins[corner].min(axis=1), self.margins[-1])
         shift = (self.plan[corner] - self.plan[-1]).transpose(0, 2, 3, 1)
         expected = self.plan[-1] + np.einsum("bkmi,bi->bkm", shift, share)
-        scale = 1e-9 * (1 + np.abs(self.plan[corner]).max(axis=(1, 2, 3)))
-        same = np.abs(plans - expected).max(axis=(1, 2)) <= scale
+        # Rounding of sums, in the units of each input; of the corners' inputs, that may cancel.
+        scale = np.abs(self.plan[corner]).max(axis=(1, 2)) + np.abs(self.plan[-1]).max(axis=0)
+        same = np.all(np.abs(plans - expected) <= 1e-9 * scale[:, None], axis=(1, 2))
         return np.where(inside, margin, -np.inf), exactly, same
 
     def _holds(self, cone: int, point: np.ndarray) -> bool:

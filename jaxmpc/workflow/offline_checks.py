@@ -419,7 +419,9 @@ def nominal_loops(mpc: MPC, x0s: np.ndarray, steps: int, set_point: SetPoint) ->
         change = np.asarray(lyapunov_decrease(run))
         run = jax.tree.map(np.asarray, run)
     solved = np.all(run.status == Status.SOLVED, axis=1)
-    scale = np.abs(run.cost[:, :-1]) + 1e-12
+    # Costs next to nothing, beside the largest of all loops, are rounding.
+    scale = np.abs(run.cost[:, :-1])
+    scale = np.maximum(scale, 1e-12 * scale[solved].max(initial=0.0) + np.finfo(float).tiny)
     relative = np.where(solved[:, None], change / scale, -np.inf)
     worst = np.unravel_index(np.argmax(relative), relative.shape)
     # Largest distance of each loop, in units of those of the starts.

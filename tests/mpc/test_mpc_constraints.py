@@ -994,7 +994,8 @@ class TestSoften:
 
 class TestEquilibrium:
     def test_random_systems(self):
-        """An answer where, and only where, an LP finds one; it holds still, inside the limits."""
+        """An answer where, and only where, an LP finds one; it holds still, inside the limits. In
+        other units of each state, input and output too."""
         found = 0
         for seed in range(200):
             rng = np.random.default_rng(seed)
@@ -1014,17 +1015,31 @@ class TestEquilibrium:
             exists = scipy.optimize.linprog(
                 np.zeros(n + m), A_eq=M, b_eq=np.concatenate([drift, target]), bounds=bounds
             ).status == 0  # fmt: skip
-            system = jm.LinearSystem(A, B, c=drift)
-            if not exists:
-                with pytest.raises(ValueError, match="target.*widen the limits"):
-                    equilibrium(system, target, C=C, states=states, inputs=inputs)
-                continue
-            found += 1
-            x, u = equilibrium(system, target, C=C, states=states, inputs=inputs)
-            np.testing.assert_allclose(A @ x + B @ u + drift, x, atol=1e-8)
-            np.testing.assert_allclose(C @ x, target, atol=1e-8)
-            assert all(lo <= v <= hi for v, (lo, hi) in
-                       zip([*x, *u], bounds, strict=True) if lo is not None)  # fmt: skip
+            found += exists
+            units = [np.ones(size) for size in (n, m, p)]
+            far = [2.0 ** rng.integers(-40, 41, size) for size in (n, m, p)]
+            small = [np.full(n, 2.0**-50), far[1], far[2]]
+            for x_unit, u_unit, y_unit in (units, far, small):
+                system = jm.LinearSystem(
+                    x_unit[:, None] * A / x_unit, x_unit[:, None] * B / u_unit, c=x_unit * drift
+                )
+                arguments = {
+                    "target": y_unit * target,
+                    "C": y_unit[:, None] * C / x_unit,
+                    "states": states and jm.Box(x_unit * states.lower, x_unit * states.upper),
+                    "inputs": jm.Box(u_unit * inputs.lower, u_unit * inputs.upper),
+                }
+                if not exists:
+                    with pytest.raises(ValueError, match="target.*widen the limits"):
+                        equilibrium(system, **arguments)
+                    continue
+                x, u = equilibrium(system, **arguments)
+                x, u = x / x_unit, u / u_unit
+                size = max(1.0, np.abs([*x, *u]).max())
+                np.testing.assert_allclose(A @ x + B @ u + drift, x, rtol=0, atol=1e-8 * size)
+                np.testing.assert_allclose(C @ x, target, rtol=0, atol=1e-8 * size)
+                assert all(lo <= v <= hi for v, (lo, hi) in
+                           zip([*x, *u], bounds, strict=True) if lo is not None)  # fmt: skip
         assert 60 < found < 190
 
     def test_cost_vanishes_there(self):

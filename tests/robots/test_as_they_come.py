@@ -84,6 +84,54 @@ def test_the_nearest_configuration_that_can_be_held():
         arm.equilibrium(near=[0.0] * 3)
 
 
+ARM = """
+<mujoco><compiler angle="radian"/><worldbody>
+<body><joint name="first" axis="0 1 0" range="-2 2"/>
+<geom type="capsule" fromto="0 0 0 .3 0 0" size=".02" mass="{mass}" contype="0" conaffinity="0"/>
+<body pos=".3 0 0"><joint name="second" axis="0 1 0" range="-2 2"/>
+<geom type="capsule" fromto="0 0 0 .3 0 0" size=".02" mass="{mass}" contype="0" conaffinity="0"/>
+</body></body></worldbody><actuator><motor joint="first" gear="{gear}" ctrlrange="-{u} {u}"/>
+{second}</actuator></mujoco>"""
+
+
+@pytest.mark.parametrize("mass", [1.0, 2.0**-20, 2.0**-34])
+def test_no_unit_of_forces_decides_what_rests(mass):
+    """Arms of kilograms, of milligrams and lighter, in inputs of N m or of their own size."""
+    for gear in (mass, 1.0):
+        u = 10 * mass / gear
+        second = f'<motor joint="second" gear="{gear}" ctrlrange="-{u} {u}"/>'
+        arms = [
+            load(ARM.format(mass=mass, gear=gear, u=u * share, second=text))
+            for share, text in ((1, second), (1, ""), (0.2, second))
+        ]
+        q, weight = np.array([0.5, 0.4]), 9.81 * mass
+        needed = weight * 0.15 * np.cos(0.9)
+        held = [weight * 0.45 * np.cos(0.5) + needed, needed]
+        x, found = arms[0].equilibrium(q)
+        np.testing.assert_allclose(x[:2], q)
+        np.testing.assert_allclose(found * gear, [-v for v in held], rtol=1e-9)
+        text = f"no input balances the forces; {needed:.3g} are missing at second"
+        text = text.replace("+", r"\+")
+        with pytest.raises(ValueError, match=f"^q: .*{text}"):
+            arms[1].equilibrium(q)
+        with pytest.raises(ValueError, match=f"^target: .*{text}"):
+            arms[1].set_point(q)
+        with pytest.raises(ValueError, match=f"^target: .*{text}"):
+            jm.robot_mpc(arms[1], target=q)
+        with pytest.raises(ValueError, match="^target: needs u1 = "):
+            arms[2].set_point(q)
+        x, found = arms[2].equilibrium(near=q)
+        data = data_at(arms[2].mujoco, x, found)
+        mujoco.mj_forward(arms[2].mujoco, data)
+        np.testing.assert_allclose(data.qacc, 0, atol=1e-4)
+        nothing = np.zeros(2)
+        np.testing.assert_allclose(
+            arms[0].inverse_dynamics(q, nothing, nothing) * gear, [-v for v in held], rtol=1e-9
+        )
+        with pytest.raises(ValueError, match="no input balances the forces"):
+            arms[1].inverse_dynamics(q, nothing, nothing)
+
+
 WALKER = """
 <mujoco><worldbody><geom type="plane" size="2 2 .1"/>
 <body pos="0 0 .3"><freejoint name="root"/><geom size=".1" mass="3"/>

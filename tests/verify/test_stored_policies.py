@@ -19,13 +19,14 @@ A, B = np.array([[1.0, 1.0], [0.0, 1.0]]), np.array([[0.5], [1.0]])
 LINES = [np.linspace(-5.3, 5.3, 17), np.linspace(-2.1, 2.1, 18)]
 
 
-def double(policy, **fields):
+def double(policy, unit=1.0, **fields):
+    """unit: of the input."""
     given = dict(
-        states=jm.Box([-5.0, -2.0], [5.0, 2.0]), inputs=jm.Box([-1.0], [1.0]),
+        states=jm.Box([-5.0, -2.0], [5.0, 2.0]), inputs=jm.Box([-unit], [unit]),
         terminal_set=jm.Box([-1.0, -0.6], [1.0, 0.6]),
         disturbance=jm.Box([-0.1, -0.1], [0.05, 0.1]),
     )  # fmt: skip
-    system = jm.LinearSystem(A, B, np.array([0.01, 0.0]) if policy == "affine" else None)
+    system = jm.LinearSystem(A, B / unit, np.array([0.01, 0.0]) if policy == "affine" else None)
     return jm.MPC(system, np.eye(2), 0.1, 3, **given | fields, policy=policy)
 
 
@@ -88,12 +89,12 @@ def test_proves_labels_of_rates_and_blocks(tmp_path, policy, fields):
     assert result.verified == result.exactly == np.count_nonzero(label)
 
 
-@pytest.mark.parametrize("policy", ["tube", "affine"])
+@pytest.mark.parametrize(("policy", "unit"), [("tube", 1.0), ("affine", 1.0), ("affine", 2.0**-40)])
 @pytest.mark.first(1)
-def test_finds_what_is_wrong(tmp_path, policy, monkeypatch):
+def test_finds_what_is_wrong(tmp_path, policy, unit, monkeypatch):
     """A wrong label of either kind, a wrong cone or plan; a policy that breaks a limit makes wrong
     whatever rests on it."""
-    mpc = double(policy)
+    mpc = double(policy, unit)
     before = jm.map_feasible_set(mpc, mesh(LINES)).labels
     label = before.label
     wrong = int(np.flatnonzero(label == -1)[40]), *np.flatnonzero(label == 1)[[10, 20, 30]].tolist()
@@ -105,7 +106,7 @@ def test_finds_what_is_wrong(tmp_path, policy, monkeypatch):
         arrays["plan"][out] = 0.0
         arrays["label"][inside], arrays["status"][inside] = -1, jm.Status.PRIMAL_INFEASIBLE
         arrays["cone"][cone] = (arrays["cone"][cone] + 3) % arrays["cone"].max()
-        arrays["plan"][plan] += 1e-6
+        arrays["plan"][plan] += 1e-6 * unit
 
     written(tmp_path / "a.zarr", mpc, change)
     found = verify_map(tmp_path / "a.zarr")
@@ -120,7 +121,7 @@ def test_finds_what_is_wrong(tmp_path, policy, monkeypatch):
 
     def other(problem):
         fields, constants = original(problem)
-        constants["policy_answer"].data[first, *place] += 3.0
+        constants["policy_answer"].data[first, *place] += 3.0 * unit
         return fields, constants
 
     monkeypatch.setattr(stored, "policy_format", other)

@@ -12,7 +12,7 @@ import jaxmpc as jm
 from jaxmpc.app.cli import main
 from jaxmpc.feasible.map import map_points
 from jaxmpc.feasible.problem import FeasibilityProblem
-from jaxmpc.workflow.offline_checks import SetPoint
+from jaxmpc.workflow.offline_checks import SetPoint, nominal_loops
 
 
 def test_design_builds_what_its_parts_say():
@@ -107,6 +107,20 @@ def test_a_report_of_a_robust_problem_says_against_what():
     assert "every disturbance, by a policy of kind 'affine'" in text
     assert "those of a robust problem are not followed" in text
     assert "Theorem 3 is about w = 0" in text
+
+
+def test_costs_in_other_units_decrease_as_much():
+    """Of an unstable system without a terminal cost, whose cost may grow."""
+    system = jm.LinearSystem([[1.2, 1], [0, 1.1]], [[0.5], [1]], dt=1.0)
+    x0s = np.random.default_rng(0).uniform(-1.5, 1.5, (40, 2))
+    found = []
+    for unit in (1.0, 2.0**-60, 2.0**60):
+        sets = {"states": jm.Box([-5, -5], [5, 5]), "inputs": jm.Box(-1, 1)}
+        mpc = jm.MPC(system, unit * np.eye(2), 0.01 * unit * np.eye(1), 2, **sets)
+        loops = nominal_loops(mpc, x0s, 6, SetPoint.of(mpc, np.zeros(2), np.zeros(1)))
+        found.append(loops.increase)
+    assert found[0] > 0.5
+    np.testing.assert_allclose(found, found[0], rtol=1e-6)
 
 
 def test_a_map_that_runs_out_of_time_says_so():
