@@ -23,8 +23,9 @@ from jaxmpc.pytrees import named_pytree, pytree, static
 from jaxmpc.qp.linalg import arrays, eigh, matmul, solve, symmetric
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.robot import Robot, RobotModel
-from jaxmpc.systems.riccati import balanced, least_reached, lqr
+from jaxmpc.systems.riccati import least_reached, lqr
 from jaxmpc.systems.system import LinearSystem, host_matrices
+from jaxmpc.systems.units import balanced, less_identity, natural_units
 
 # Singular values of balanced matrices, relative to the largest, that count as zero.
 UNDETECTED = 1e-10
@@ -315,7 +316,7 @@ class KalmanFilter:
         A, B, _ = host_matrices(system)
         n, k = system.n, self.disturbances
         C = np.asarray(self._matrix(float))
-        M = np.block([[A - np.eye(n), self.on_states(B)], [C, self.matrix("output")]])
+        M = np.block([[less_identity(A), self.on_states(B)], [C, self.matrix("output")]])
         row, column = balanced(M)
         _, values, axes = np.linalg.svd(row[:, None] * M * column)
         if values[n + k - 1] > UNDETECTED * values[0]:
@@ -441,8 +442,10 @@ class KalmanFilter:
         C = (np if concrete(C, of_loads) else jnp).concatenate([C, of_loads], axis=1)
         if concrete(A, C, W, V):
             A, C, W, V = (np.asarray(v, float) for v in (A, C, W, V))
-            variances, axes = np.linalg.eigh((W + W.T) / 2)
-            pushed = axes * np.sqrt(np.maximum(variances, 0))
+            units = natural_units(A.T, C.T, W, V)
+            noise, _ = units.weights((W + W.T) / 2, V)
+            variances, axes = np.linalg.eigh(noise)
+            pushed = axes / units.states[:, None] * np.sqrt(np.maximum(variances, 0))
             for argument, (found, mode), problem, cure in (
                 ("C", least_reached(A.T, C.T), "no output shows", "Measure it"),
                 ("process", least_reached(A, pushed), "no noise moves", "Give it some, or initial"),

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxmpc.arrays import Reals, as_weight
+from jaxmpc.arrays import Reals, as_weight, host_array
 from jaxmpc.checks import concrete, fail, whole
 from jaxmpc.closed_loop.feedback import first_row, one_state
 from jaxmpc.mpc.controller import Controller, zeros_of
@@ -33,7 +33,8 @@ from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.robot import Robot, RobotModel
 from jaxmpc.sets.convex_sets import Box
 from jaxmpc.systems.riccati import least_reached, lqr
-from jaxmpc.systems.system import LinearSystem
+from jaxmpc.systems.system import LinearSystem, host_matrices
+from jaxmpc.systems.units import natural_units
 
 
 def robot_mpc(
@@ -166,9 +167,13 @@ def _terminal_cost(
     The reached part T'x follows T'AT and T'B, driven by the rest as by a disturbance, which P
     leaves out: no input changes that rest.
     """
-    A, B = np.asarray(system.A), np.asarray(system.B)
+    A, B, _ = host_matrices(system)
     if least_reached(A, B)[0] > _UNREACHED:
         return np.asarray(lqr(system, Q, R).P)
+    r = host_array("R", R)
+    units = natural_units(A, B, Q, r)
+    A, B = units.system(A, B)
+    Q, r = units.weights(Q, r)
     T = reached_subspace(A, B)
     if names:
         unmoved = np.flatnonzero(np.linalg.norm(T, axis=1) < 0.999)
@@ -178,7 +183,7 @@ def _terminal_cost(
             stacklevel=3,
         )
     reduced = LinearSystem(T.T @ A @ T, T.T @ B)
-    return T @ np.asarray(lqr(reduced, T.T @ Q @ T, R).P) @ T.T
+    return units.cost_matrix(T @ np.asarray(lqr(reduced, T.T @ Q @ T, r).P) @ T.T)
 
 
 # Modes closer than this to unreachable count as such, as in `lqr`.

@@ -51,6 +51,7 @@ from jaxmpc.qp.linalg import (
 from jaxmpc.qp.problem import QP, Bounds
 from jaxmpc.systems.riccati import lqr
 from jaxmpc.systems.system import LinearSystem, host_matrices
+from jaxmpc.systems.units import natural_units
 
 
 @pytree
@@ -196,7 +197,8 @@ def prestabilising_gain(mpc: MPC) -> Any:
         return none
     if concrete(mpc.Q, mpc.R) and np.ndim(mpc.Q) == np.ndim(mpc.R) == 2:
         Q, R = host_array("Q", mpc.Q), host_array("R", mpc.R)
-    Q = Q + 1e-3 * max(np.trace(Q) / len(Q), 1e-9) * np.eye(len(Q))
+    units = natural_units(A, B, Q, R)
+    Q = Q + 1e-3 * units.cost_matrix(np.eye(len(Q)))
     if np.linalg.eigvalsh((R + R.T) / 2)[0] <= 0:
         R = R + 1e-3 * np.diag(np.diag(B.T @ Q @ B))
     try:

@@ -573,6 +573,9 @@ class MPC:
             for name in ("disturbance_matrix", "gain"):
                 if getattr(self, name) is not None:
                     fail(name, "given without a disturbance", "Give disturbance=jm.Box(…) too")
+            if self.policy != "tightened":
+                cure = "Give disturbance=jm.Box(…) too, or leave policy out"
+                fail("policy", f"{self.policy!r} without a disturbance", cure)
             return
         self.require_constant("policies against a disturbance know one for all", *HARD, "soft")
         if self.gain is None and self.policy != "affine":

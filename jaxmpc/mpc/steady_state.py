@@ -23,8 +23,8 @@ from jaxmpc.qp.residuals import with_fault
 from jaxmpc.qp.solve import solve_factored
 from jaxmpc.sets.convex_sets import Box
 from jaxmpc.sets.lp import scaling
-from jaxmpc.systems.riccati import balanced
 from jaxmpc.systems.system import LinearSystem, host_matrices
+from jaxmpc.systems.units import balanced, less_identity
 
 # Singular values of balanced matrices, relative to the largest, that count as zero.
 FLAT = 1e-10
@@ -66,7 +66,7 @@ def equilibrium(
     target = host_array("target", target)
     require_finite("target", target)
     A, B, c = host_matrices(system)
-    M = np.vstack([_steady_rows(A, B), np.hstack([C, np.zeros((len(C), m))])])
+    M = np.vstack([np.hstack([-less_identity(A), -B]), np.hstack([C, np.zeros((len(C), m))])])
     value = np.concatenate([c, target])
     low, high = np.full(n + m, -np.inf), np.full(n + m, np.inf)
     for set_, part, name, size in (
@@ -113,13 +113,6 @@ def equilibrium(
     return found[:n], found[n:]
 
 
-def _steady_rows(A: np.ndarray, B: np.ndarray) -> np.ndarray:
-    """Return [I − A, −B]; a diagonal of A that differs from 1 by rounding counts as 1."""
-    stays = np.eye(len(A)) - A
-    stays[np.abs(stays) <= 4 * np.finfo(float).eps * np.eye(len(A))] = 0.0
-    return np.hstack([stays, -B])
-
-
 @named_pytree
 class SteadyState(NamedTuple):
     """A state x (n,) that the input u (m,) holds, and the status of the search for it."""
@@ -164,7 +157,7 @@ class SteadyStates:
         mpc.require_constant("a steady state has one for all", *HARD, "soft")
         A, B, c = host_matrices(system)
         n, m = B.shape
-        M = _steady_rows(A, B)
+        M = np.hstack([-less_identity(A), -B])
         row, column = balanced(M)
         left, values, right = np.linalg.svd(row[:, None] * M * column)
         if values[-1] <= FLAT * values[0]:

@@ -15,6 +15,7 @@ from jaxmpc.pytrees import pytree
 from jaxmpc.qp.jax_transformations import own_modes, varying
 from jaxmpc.qp.linalg import arrays, floating_dtype, in_float64, matmul, solve, solve_general
 from jaxmpc.systems.system import LinearSystem
+from jaxmpc.systems.units import natural_units
 
 # Modes closer than this to unreachable (least singular value, relative) count as such.
 _UNREACHED = 1e-10
@@ -77,12 +78,14 @@ def lqr(system: LinearSystem, Q: Reals, R: Reals) -> LQR:
         require_symmetric_psd("R", R, definite=True)
         return _traced(system.A, system.B, Q, R)
     A, B = host_array("A", system.A), host_array("B", system.B)
-    Q, R = host_array("Q", Q), host_array("R", R)
-    require_symmetric_psd("Q", Q)
-    require_symmetric_psd("R", R, definite=True)
-    Q, R = (Q + Q.T) / 2, (R + R.T) / 2
-    weights, axes = np.linalg.eigh(Q)
-    output = np.sqrt(np.maximum(weights, 0.0))[:, None] * axes.T  # Q = output'output
+    q, r = host_array("Q", Q), host_array("R", R)
+    require_symmetric_psd("Q", q)
+    require_symmetric_psd("R", r, definite=True)
+    units = natural_units(A, B, q, r)
+    A, B = units.system(A, B)
+    q, r = units.weights((q + q.T) / 2, (r + r.T) / 2)
+    weights, axes = np.linalg.eigh(q)
+    output = np.sqrt(np.maximum(weights, 0.0))[:, None] * axes.T  # q = output'output
     moved, seen = _rank_tests(A, B), _rank_tests(A.T, output.T)
     (control, _), (cost, _) = _least(moved), _least(seen)
     unmoved = f"does not move {_described(moved, system.state_names)}"
@@ -92,8 +95,8 @@ def lqr(system: LinearSystem, Q: Reals, R: Reals) -> LQR:
     if cost <= _UNREACHED:
         fail("Q", f"not detectable: {unseen}", "Give it some")
     try:
-        P = _refine(A, B, Q, R, scipy.linalg.solve_discrete_are(A, B, Q, R))
-        K = _gain(A, B, R, P)
+        P = _refine(A, B, q, r, scipy.linalg.solve_discrete_are(A, B, q, r))
+        K = _gain(A, B, r, P)
         radius = np.abs(np.linalg.eigvals(A + B @ K)).max()
     except (np.linalg.LinAlgError, ValueError):
         radius = np.inf
@@ -102,7 +105,7 @@ def lqr(system: LinearSystem, Q: Reals, R: Reals) -> LQR:
         if control <= cost:
             fail("B", f"hardly {unmoved}, {rest}", "Actuate that")
         fail("Q", f"hardly {unseen}, {rest}", "Give it some")
-    return LQR(K=K, P=P)
+    return LQR(K=units.gain(K), P=units.cost_matrix(P))
 
 
 def cost_of_law(system: LinearSystem, K: Reals, Q: Reals, R: Reals) -> Array | np.ndarray:
@@ -122,17 +125,22 @@ def cost_of_law(system: LinearSystem, K: Reals, Q: Reals, R: Reals) -> Array | n
     if concrete(*data):
         a, b, k, q, r = (host_array("system, K, Q, R", part) for part in data)
         closed = a + b @ k
+        units = natural_units(a, b, q, r)
+        closed, _ = units.system(closed, b)
         radius = np.abs(np.linalg.eigvals(closed)).max()
         if not radius < 1:
             fail("K", f"A + BK has spectral radius {radius:.9g}", "Use a stabilizing K with u = Kx")
-        P = scipy.linalg.solve_discrete_lyapunov(closed.T, q + k.T @ r @ k)
-        return (P + P.T) / 2
+        cost, _ = units.weights(q + k.T @ r @ k, r)
+        P = scipy.linalg.solve_discrete_lyapunov(closed.T, cost)
+        return units.cost_matrix((P + P.T) / 2)
     dtype = floating_dtype(tuple(jnp.asarray(part) for part in data))
     A, B, gain, W, V = (jnp.asarray(part, dtype) for part in data)
-    loop = A + matmul(B, gain)
-    cost = _solve_lyapunov(loop, W + matmul(gain.T, matmul(V, gain)))
+    units = natural_units(A, B, W, V)
+    loop, _ = units.system(A + matmul(B, gain), B)
+    stage, _ = units.weights(W + matmul(gain.T, matmul(V, gain)), V)
+    cost = _solve_lyapunov(loop, stage)
     _, left = _power_sum(jax.lax.stop_gradient(loop), jnp.zeros_like(W))
-    return jnp.where(left < 1e-3, (cost + cost.T) / 2, jnp.nan)
+    return jnp.where(left < 1e-3, units.cost_matrix((cost + cost.T) / 2), jnp.nan)
 
 
 def _gain(A: np.ndarray, B: np.ndarray, R: np.ndarray, P: np.ndarray) -> np.ndarray:
@@ -171,9 +179,11 @@ def _traced(*data: Reals) -> LQR:
     values = tuple(jnp.asarray(v) for v in data)  # lists of traced numbers
     dtype = floating_dtype(values)
     A, B, Q, R = (v.astype(dtype) for v in arrays(values))
-    Q, R = (Q + Q.T) / 2, (R + R.T) / 2
+    units = natural_units(A, B, Q, R)
+    A, B = units.system(A, B)
+    Q, R = units.weights((Q + Q.T) / 2, (R + R.T) / 2)
     P = _solution(A, B, Q, R)
-    return LQR(K=_traced_gain(A, B, R, P), P=P)
+    return LQR(K=units.gain(_traced_gain(A, B, R, P)), P=units.cost_matrix(P))
 
 
 def _traced_gain(A: Array, B: Array, R: Array, P: Array) -> Array:
@@ -288,9 +298,9 @@ def least_reached(A: np.ndarray, B: np.ndarray) -> tuple[float, str]:
     (inf, "none") if all decay.
 
     Popov-Belevitch-Hautus: all are reached if [A - s I, B] has full row rank at every
-    eigenvalue |s| >= 1. The distance is its least singular value.
+    eigenvalue |s| >= 1. The distance is its least singular value, in `natural_units`.
     """
-    return _least(_rank_tests(A, B))
+    return _least(_rank_tests(*natural_units(A, B).system(A, B)))
 
 
 def _rank_tests(A: np.ndarray, B: np.ndarray) -> list[_RankTest]:
@@ -305,22 +315,6 @@ def _rank_tests(A: np.ndarray, B: np.ndarray) -> list[_RankTest]:
             vectors, values, _ = np.linalg.svd(np.hstack([A - s * np.eye(len(A)), B]))
             tests.append(_RankTest(complex(s), vectors, values / size))
     return tests
-
-
-def balanced(M: np.ndarray, sweeps: int = 10) -> tuple[np.ndarray, np.ndarray]:
-    """Return powers of two (row, column) with which the largest entry of each row and column of
-    row_i M_ij column_j is about 1, so that no choice of units decides what counts as zero.
-
-    Each sweep divides rows and columns by the roots of their largest entries (Ruiz 2001, report
-    RAL-TR-2001-034). Rows and columns of zeros keep the unit 1.
-    """
-    row, column = np.ones(M.shape[0]), np.ones(M.shape[1])
-    for _ in range(sweeps):
-        size = np.abs(row[:, None] * M * column)
-        ends = size.max(axis=1, initial=0.0), size.max(axis=0, initial=0.0)
-        each = [2.0 ** -np.round(np.log2(np.where(end > 0, end, 1.0)) / 2) for end in ends]
-        row, column = row * each[0], column * each[1]
-    return row, column
 
 
 def _least(tests: list[_RankTest]) -> tuple[float, str]:

@@ -206,7 +206,7 @@ def test_bad_environments_are_named(environment):
         (lambda: Environment.of(robot, length=0), "length: 0"),
         (lambda: Environment.of(robot, spread=-1.0), "spread: -1.0. Give a fraction"),
         (lambda: Environment.of(robot, Q=[1.0, 1.0, 1.0], R=[1.0]), "Q: shape"),
-        (lambda: Environment.of(robot, [1.0], Q=[1.0, 1.0], R=[1.0]), "q: needs torque"),
+        (lambda: Environment.of(robot, [1.0], Q=[1.0, 1.0], R=[1.0]), "target: needs torque"),
         (lambda: environment.step(state, np.zeros(2)), r"action: shape \(2,\) where \(1,\)"),
         (lambda: policy(np.zeros(3)), r"observation: shape \(3,\) where"),
     ):

@@ -110,6 +110,30 @@ def test_estimates_converge_without_noise():
     assert plain.estimates is None and known.estimates.shape == (STEPS, 2)
 
 
+def test_units_of_states_and_outputs_decide_nothing():
+    """Units up to 2^40 apart: the same gain of the steady state, or the same error."""
+    hidden = np.array([[1.0, 0, 0]])
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        A, C = 0.6 * rng.normal(size=(3, 3)), rng.normal(size=(2, 3))
+        process, measured = rng.uniform(0.1, 1, 3), rng.uniform(0.1, 1, 2)
+        if seed % 4 == 0:
+            A = np.eye(3) + 0.1 * np.eye(3, k=1)
+        x, y = 2.0 ** rng.integers(-20, 21, 3), 2.0 ** rng.integers(-20, 21, 2)
+        system = jm.LinearSystem(A, np.ones((3, 1)))
+        scaled = jm.LinearSystem(x[:, None] * A / x, np.ones((3, 1)))
+        plain = KalmanFilter(system, process, measured, C).prepared().gain
+        found = KalmanFilter(scaled, x * process, y * measured, y[:, None] * C / x).prepared().gain
+        np.testing.assert_allclose(found / x[:, None] * y, plain, rtol=1e-8, atol=1e-10)
+        if seed % 4 == 0:
+            for M, noise, argument in ((A.T, process, "C"), (A, [1.0, 0, 0], "process")):
+                for k in (np.ones(3), x):
+                    system = jm.LinearSystem(k[:, None] * M / k, np.ones((3, 1)))
+                    observer = KalmanFilter(system, k * noise, measured[:1], hidden / k)
+                    with pytest.raises(ValueError, match=f"observer.{argument}: no (out|noise)"):
+                        observer.prepared()
+
+
 def test_time_varying_filter_is_the_textbook_recursion():
     """Covariances and estimates of the extended filter, on a linear plant, by NumPy."""
     P = np.diag([0.2, 0.5])

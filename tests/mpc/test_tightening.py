@@ -290,6 +290,7 @@ def test_recursive_feasibility_needs_a_robust_terminal_set():
         ({"gain": np.ones((2, 2))}, "gain: shape"),
         ({"policy": "rigid"}, "policy: 'rigid'"),
         ({"disturbance": None, "gain": [[1.0, 1.0]]}, "gain: given without a disturbance"),
+        ({"disturbance": None, "policy": "tube"}, "policy: 'tube' without a disturbance. Give"),
         ({"terminal_set": jm.Ellipsoid(np.eye(2), 1.0)}, "no rows to tighten"),
         ({"disturbance": jm.Box(-2.0, 2.0)}, "takes more than there is of input u1: at k = 1"),
         ({"Q": np.zeros((2, 2))}, "gain: is None, and Q and R have no LQR"),

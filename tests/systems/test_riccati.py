@@ -2,10 +2,12 @@
 
 import math
 
+import jax
 import numpy as np
 import pytest
 
 from jaxmpc import LinearSystem, lqr
+from jaxmpc.systems.riccati import cost_of_law
 
 # A robot joint (inertia 0.05, 10 ms) and the double integrator of MPT3's test suite, with
 # O_inf of their LQR from an exact rational recursion.
@@ -57,6 +59,52 @@ def test_lqr_satisfies_the_riccati_equation(seed):
         u = law.K @ x
         cost, x = cost + x @ Q @ x + u @ R @ u, A @ x + B @ u
     assert cost == pytest.approx(x0 @ law.P @ x0, rel=1e-10)
+
+
+@pytest.mark.parametrize("kind", ["random", "chain", "unmoved", "unseen"])
+def test_units_decide_nothing(kind):
+    """States, inputs and cost in units up to 2^40 apart: the same law, or the same error; the
+    Kalman filter is the same of the dual system."""
+    refused = 0
+    traced = jax.jit(lambda *data: lqr(LinearSystem(*data[:2]), *data[2:]))
+    cost = jax.jit(lambda *data: cost_of_law(LinearSystem(*data[:2]), *data[2:]))
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        n, m = 4, 2
+        A, B = rng.normal(size=(n, n)) * rng.choice([0.4, 0.7]), rng.normal(size=(n, m))
+        Q, R = np.diag(rng.uniform(0.1, 1, n)), np.diag(rng.uniform(0.1, 1, m))
+        if kind == "chain":  # with entries of rounding in place of zeros
+            A, B = np.eye(n) + 0.1 * np.eye(n, k=1), np.zeros((n, m))
+            A, B[-1], Q = A + 1e-17 * rng.normal(size=A.shape), 0.1, np.diag([1.0, 0, 0, 0])
+        if kind == "unmoved":
+            A[-1], B[-1] = [0, 0, 0, rng.choice([0.5, 1.2])], 0
+        if kind == "unseen":
+            A[:-1, -1], A[-1, -1], Q[-1, -1] = 0, rng.choice([0.5, 1.2]), 0
+        x, u = 2.0 ** rng.integers(-20, 21, n), 2.0 ** rng.integers(-20, 21, m)
+        v = 2.0 ** rng.integers(-60, 61)
+        other = (
+            *(x[:, None] * A / x, x[:, None] * B / u),
+            *(v * Q / x / x[:, None], v * R / u / u[:, None]),
+        )
+        try:
+            law = lqr(LinearSystem(A, B), Q, R)
+        except ValueError as error:
+            refused += 1
+            argument = str(error).split()[0]
+            with pytest.raises(ValueError, match=f"^{argument} not (stabiliz|detect)able"):
+                lqr(LinearSystem(*other[:2]), *other[2:])
+            with jax.enable_x64(True):
+                assert not np.any(np.isfinite(traced(*other).P))
+            continue
+        with jax.enable_x64(True):
+            for found in (lqr(LinearSystem(*other[:2]), *other[2:]), traced(*other)):
+                K, P = (np.asarray(v, float) for v in (found.K, found.P))
+                np.testing.assert_allclose(u[:, None] ** -1 * K * x, law.K, rtol=1e-7, atol=1e-9)
+                np.testing.assert_allclose(x[:, None] * P * x / v, law.P, rtol=1e-7, atol=1e-9)
+            for call in (lambda A, B, *data: cost_of_law(LinearSystem(A, B), *data), cost):
+                P = np.asarray(call(*other[:2], K, *other[2:]))
+                np.testing.assert_allclose(x[:, None] * P * x / v, law.P, rtol=1e-7, atol=1e-9)
+    assert (0 < refused < 20) == (kind in ("unmoved", "unseen"))
 
 
 TURN = np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
