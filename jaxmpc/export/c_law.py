@@ -18,14 +18,14 @@ from jaxmpc.export.c_files import CFiles, input_limits, literal
 
 # How far beyond a facet counts as inside, relative to the size of X_N.
 TOLERANCE = {"float64": 1e-9, "float32": 1e-5}
-# Decimals, relative to the size of X_N, to which facets of two regions are the same.
+# Decimals, relative to the extent of X_N, to which facets of two regions are the same.
 DECIMALS = 9
 
 
 class Facets(NamedTuple):
     """Half-spaces a'x ≤ b, each stored once: normal (planes, p), offset (planes,); of the facets of
     all regions, region after region, its plane, the side (1, or −1 for a'x ≥ b), and where each
-    region begins (regions + 1,)."""
+    region begins (regions + 1,). b − a'x is the distance in units of the extent of X_N."""
 
     normal: np.ndarray
     offset: np.ndarray
@@ -34,11 +34,12 @@ class Facets(NamedTuple):
     begin: np.ndarray
 
     @classmethod
-    def of(cls, regions: CriticalRegions, size: float) -> "Facets":
-        """Return the facets of regions in X_N of this size."""
+    def of(cls, regions: CriticalRegions, extent: np.ndarray) -> "Facets":
+        """Return the facets of regions in X_N, whose extent is (p,)."""
         H, h, starts = regions.facets
-        whole = np.column_stack([H, h])
-        rounded = np.round(np.hstack([whole[:, :-1], whole[:, -1:] / size]), DECIMALS)
+        length = np.linalg.norm(H * extent, axis=1, keepdims=True)
+        whole = np.column_stack([H, h]) / length
+        rounded = np.round(whole * np.append(extent, 1.0), DECIMALS)
         # The first entry that is not zero is positive, so that both sides are one plane.
         lead = rounded[np.arange(len(rounded)), np.argmax(rounded[:, :-1] != 0, axis=1)]
         side = np.where(lead < 0, -1, 1)
@@ -113,7 +114,7 @@ def export_explicit_c(
     regions: of `critical_regions`, all of them. name: with which files and C functions begin.
     folder: where NAME.c, NAME.h, NAME_sizes.h, NAME_tables.h and NAME_example.c are written. dtype:
     type of all numbers there. tolerance: distance beyond a facet that counts as inside, relative to
-    the size of the feasible set, None: 1e-9, and 1e-5 in float32.
+    the extent of the feasible set in each coordinate, None: 1e-9, and 1e-5 in float32.
 
     Returns the paths. Raises ValueError where not all regions were found, for a name that C does
     not take, and for files that exist, unless overwrite.
@@ -132,9 +133,8 @@ def export_explicit_c(
         cure = "Give critical_regions a bounded set within that has volume"
         fail("regions", f"are those of a feasible set that is {what}", cure)
     vertices = [region.vertices for region in regions.regions]
-    size = float(np.ptp(np.concatenate(vertices), axis=0).max())
-    facets = Facets.of(regions, size)
-    tree = SearchTree.of(facets, vertices, 1e-9 * size)
+    facets = Facets.of(regions, np.ptp(np.concatenate(vertices), axis=0))
+    tree = SearchTree.of(facets, vertices, 1e-9)
     mpc = regions.mpc
     tables = {
         "plane_normal": facets.normal.ravel(),
@@ -158,6 +158,6 @@ def export_explicit_c(
         "DEPTH": tree.depth,
         "MOST": int(tree.outside[tree.plane < 0].max()),  # regions of a leaf
         "RATES": int(mpc.rate_limited),
-        "TOLERANCE": literal(files.tolerance * size, files.real).replace("(real)", ""),
+        "TOLERANCE": literal(files.tolerance, files.real).replace("(real)", ""),
     }
     return files.write(("law.h", "law.c", "law_example.c"), sizes, tables, mpc.dimension)

@@ -65,7 +65,7 @@ def export_c(
 
     folder: where NAME.c, NAME.h, NAME_sizes.h, NAME_tables.h and NAME_example.c are written. dtype:
     type of all numbers there; the tables are computed in float64. tolerance: of the residuals
-    relative to 1 and their largest term, None: 1e-6, and 1e-3 in float32.
+    relative to the largest of their terms and `sizes_of_code`, None: 1e-6, and 1e-3 in float32.
 
     Returns the paths. Raises ValueError for a problem that cannot be solved, a name that C does not
     take, and files that exist, unless overwrite.
@@ -119,6 +119,9 @@ def _tables(controller: Controller) -> dict[str, Any]:
     mpc, c = controller.mpc, controller.condensed
     assert c is not None
     tables = jax.tree.map(np.asarray, _computed(controller)) | input_limits(mpc)
+    tables["row_size"], tables["variable_size"] = jax.tree.map(
+        np.asarray, sizes_of_code(controller)
+    )
     if c.balls:
         tables["ball_rows"] = np.array(c.balls)
     if not isinstance(c, PolicyCondensed):
@@ -128,6 +131,28 @@ def _tables(controller: Controller) -> dict[str, Any]:
         tables["later_move"] = np.array(later, int)
         tables["later_row"] = tables["later_row"].astype(int) - 1
     return {key: np.asarray(value) for key, value in tables.items()}
+
+
+@jax.jit
+def sizes_of_code(controller: Controller) -> tuple[jax.Array, jax.Array]:
+    """Return sizes of rows (m,) and of gradients in the variables (nz,), in the units of the
+    problem: beside them, or beside their terms where these are larger, the code finds residuals
+    small. So they are at the origin too, where all terms vanish.
+
+    A row has the size of its nearest bound that is not 0. In the coordinates of ADMM, where the
+    Hessian is the identity, states and gradients are lengths alike: the median over the rows of how
+    far these bounds are is the size of the variables, and of rows without such a bound.
+    """
+    c, factor = controller.condensed, controller.factor
+    assert c is not None and factor is not None
+    ends = jnp.abs(jnp.stack([c.lower, c.upper]))
+    nearest = jnp.min(jnp.where((ends > 0) & jnp.isfinite(ends), ends, jnp.inf), axis=0)
+    length = jnp.nanmedian(
+        jnp.where(jnp.isfinite(nearest) & (factor.E > 0), nearest * factor.E, jnp.nan)
+    )
+    length = jnp.where(jnp.isfinite(length), length, 0.0)
+    rows = jnp.where(jnp.isfinite(nearest), nearest, length * factor.row_norms)
+    return rows, length / jnp.sum(jnp.abs(factor.T), axis=1)
 
 
 @jax.jit  # in one program, not in a hundred small ones
@@ -246,11 +271,15 @@ def target_of(mpc: MPC, reference: Reals | None, input_reference: Reals | None) 
     return checked("reference", reference, n), checked("input_reference", input_reference, m)
 
 
-def solved_by_code(plan: Plan, tolerance: Any) -> Any:
-    """Return whether the code says SOLVED of a plan: its residuals are small beside 1, where those
-    of a `Plan` near the origin are measured by its own size."""
-    residual = jnp.maximum(plan.primal_residual, plan.dual_residual)
-    return (plan.status == Status.SOLVED) | (residual <= tolerance)
+def solved_by_code(controller: Controller, plan: Plan, tolerance: Any) -> Any:
+    """Return whether the code says SOLVED of a plan: its residuals are small beside `sizes_of_code`
+    (here the least of these), where those of a `Plan` near the origin are measured by its own
+    size."""
+    rows, variables = (jnp.min(v, initial=jnp.inf) for v in sizes_of_code(controller))
+    small = (plan.primal_residual <= tolerance * rows) & (
+        plan.dual_residual <= tolerance * variables
+    )
+    return (plan.status == Status.SOLVED) | small
 
 
 @jax.jit  # compiled once for all controllers of a problem
@@ -330,7 +359,7 @@ def check_fixed_steps(
             x, before = state
             control = fixed(x, before, target[0], input_reference=target[1])
             after = matmul(A, x) + matmul(B, control.u) + drift
-            solved = solved_by_code(control.plan, tolerance)
+            solved = solved_by_code(fixed, control.plan, tolerance)
             return (after, control), (x, before.u, control.u, solved)
 
         def loop(x: Any) -> Any:

@@ -44,10 +44,8 @@ static void product(int rows, int columns, const real *RESTRICT A, const real *R
 /* The larger one; NaN where either is, which fmax drops. */
 static real larger(real a, real b) { return a >= b || a != a ? a : b; }
 
-static real largest(int count, const real *v, real most) {
-  for (int i = 0; i < count; i++) most = larger(most, FABS(v[i]));
-  return most;
-}
+/* |v| beside a size; 0 beside 0 is 0. */
+static real relative(real v, real size) { return v == 0 ? 0 : FABS(v) / size; }
 
 static int all_finite(int count, const real *v) {
   int finite = 1;
@@ -240,7 +238,7 @@ int NAME_step(NAME_memory *memory, const real x[N], const real *state_reference,
   product(NZ, M, ZF + (STAGES - 1) * NZ * M, r, 1, z);
   product(M, NZ, C, z, 0, image);
 
-  real primal = 0, most_primal = 1, dual = 0, most_dual = largest(NZ, q, 1);
+  real primal = 0, dual = 0;
   for (int i = 0; i < M; i++) {
     /* A row that no move changes keeps its limit or does not; its penalty has a slope. */
     real least = lower[i] - shift[i], top = upper[i] - shift[i];
@@ -255,18 +253,16 @@ int NAME_step(NAME_memory *memory, const real x[N], const real *state_reference,
       near = image[i];
 #endif
     }
-    primal = larger(primal, FABS(image[i] - near));
-    most_primal = larger(most_primal, larger(FABS(image[i]), FABS(near)));
+    real size = larger(row_size[i], larger(FABS(image[i]), FABS(near)));
+    primal = larger(primal, relative(image[i] - near, size));
   }
   product(NZ, NZ, P, z, 0, spare);
-  most_dual = largest(NZ, spare, most_dual);
   for (int i = 0; i < NZ; i++) {
     real force = 0;
     for (int j = 0; j < M; j++) force += C[i * M + j] * y[j];
-    most_dual = larger(most_dual, FABS(force));
-    dual = larger(dual, FABS(spare[i] + q[i] + force));
+    real size = larger(larger(variable_size[i], FABS(force)), larger(FABS(spare[i]), FABS(q[i])));
+    dual = larger(dual, relative(spare[i] + q[i] + force, size));
   }
-  primal /= most_primal, dual /= most_dual;
   int solved = primal <= NAME_TOLERANCE && dual <= NAME_TOLERANCE; /* false for NaN */
   int status = solved ? NAME_SOLVED : NAME_NOT_SOLVED;
 

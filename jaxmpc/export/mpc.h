@@ -33,8 +33,8 @@ typedef struct {
 
 typedef struct {
   int status;
-  /* Largest |Cz - s|, s the nearest point that keeps the limits, and largest |Pz + q + C'y|, each
-   * relative to 1 and to its largest term. */
+  /* Largest entry of |Cz - s|, s the nearest point that keeps the limits, and of |Pz + q + C'y|,
+   * each relative to the largest of its terms and its row_size or variable_size in the tables. */
   NAME_real primal_residual, dual_residual;
 } NAME_info;
 

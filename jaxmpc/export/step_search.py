@@ -143,7 +143,7 @@ def _improved(
         def step(state: Any, _: Any) -> Any:
             x, before = state
             control = controller(x, before, target[0], input_reference=target[1])
-            solved = solved_by_code(control.plan, controller.solver.eps)
+            solved = solved_by_code(controller, control.plan, controller.solver.eps)
             return (system.step(x, control.u), control), solved
 
         loop = lambda x: jax.lax.scan(step, (x, controller.start(x)), length=length)[1]

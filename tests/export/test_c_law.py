@@ -66,6 +66,35 @@ def test_every_state_has_the_input_of_its_region(regions, tmp_path, dtype, error
 
 
 @compiled
+def test_a_law_in_other_units(regions, tmp_path):
+    """The code is that of the plain problem, also where states' units are far apart."""
+    mpc, random = regions.mpc, np.random.default_rng(0)
+    points = np.concatenate([r.vertices for r in regions.regions])
+    inside = [random.dirichlet(np.ones(len(r.vertices)), 20) @ r.vertices for r in regions.regions]
+    extent = np.ptp(points, axis=0)
+    states = np.concatenate([*inside, 0.6 * random.uniform(-extent, extent, (500, 2))])
+    sides = [np.asarray(r.polytope.H) @ states.T - np.asarray(r.polytope.h)[:, None]
+             for r in regions.regions]  # fmt: skip
+    states = states[np.min(np.abs(np.concatenate(sides)), axis=0) > 1e-5]
+    plain = built(regions, tmp_path)
+    wanted = [plain(x) for x in states]
+    for i, x in enumerate(2.0 ** np.array([[-40, -40], [30, 30], [-25, 25], [25, -25]])):
+        scaled = replace(
+            mpc, system=jm.LinearSystem(x[:, None] * mpc.system.A / x, x[:, None] * mpc.system.B),
+            Q=mpc.Q / x / x[:, None], terminal_cost=mpc.terminal_cost / x / x[:, None],
+            states=jm.Box(x * mpc.states.lower, x * mpc.states.upper),
+            terminal_set=jm.Polytope(mpc.terminal_set.H / x, mpc.terminal_set.h),
+        )  # fmt: skip
+        folder = tmp_path / str(i)
+        folder.mkdir()
+        law = built(jm.explicit.critical_regions(scaled), folder)
+        for state, (u, status) in zip(states, wanted, strict=True):
+            found, said = law(x * state)
+            assert said == status
+            np.testing.assert_allclose(found, u, rtol=0, atol=1e-9)
+
+
+@compiled
 @pytest.mark.slow
 def test_closed_loop_is_the_solvers(tmp_path):
     """With previous inputs in the state: as many numbers as the problem has parameters."""

@@ -174,6 +174,55 @@ def test_status_is_true_and_bad_states_are_answered(tmp_path):
 
 @compiled
 @pytest.mark.slow
+def in_units(x, u, cost):
+    """The pendulum in other units of its states (2,) and inputs (2,), and of its cost."""
+    mpc = pendulum(horizon=3)
+    system = jm.LinearSystem(
+        x[:, None] * mpc.system.A / x, x[:, None] * mpc.system.B / u, x * mpc.system.c
+    )
+    return replace(
+        mpc, system=system, Q=cost * mpc.Q / x / x[:, None], R=cost * 0.1 * np.diag(1 / u**2),
+        states=jm.Box(x * mpc.states.lower, x * mpc.states.upper),
+        inputs=jm.Box(u * mpc.inputs.lower, u * mpc.inputs.upper),
+        terminal_cost=cost * mpc.terminal_cost / x / x[:, None],
+    )  # fmt: skip
+
+
+@compiled
+@pytest.mark.parametrize("iterations", [12, 200])
+def test_a_status_in_other_units(iterations, tmp_path):
+    """Of micrometres, millions of newtons and small costs: the same, and what is SOLVED is, also
+    at rest."""
+    one = np.ones(2)
+    random = np.random.default_rng(0)
+    states = [np.zeros(2), *random.uniform(-0.6, 0.6, (30, 2)), [0.9, 1.4]]
+    units = [
+        (one, one, 1.0),
+        (2.0**-20 * one, 2.0**20 * one, 1.0),
+        (2.0 ** np.array([-30, 30]), one, 1.0),
+        (2.0**20 * one, 2.0**-20 * one, 2.0**-40),
+    ]
+    found = []
+    for i, (x, u, cost) in enumerate(units):
+        mpc, solver = in_units(x, u, cost), jm.ADMM(iterations=iterations, newton_steps=0)
+        code = Compiled(mpc, solver, tmp_path, name=f"law{i}")
+        answers = []
+        for x0 in states:
+            code.memory[:] = 0
+            answer, status = code.step(x * x0)
+            answers.append([*(answer / u), status])
+        found.append(answers)
+    best = [jm.solve(in_units(one, one, 1.0), x0) for x0 in states]
+    solved = np.array(found)[:, :, 2] == 1
+    assert np.all(solved == solved[0]) and not np.any(solved[:, -1])
+    assert 0 < solved[0].sum() < 10 if iterations == 12 else solved[0].sum() > 25
+    for answers in found:
+        for (*u, status), plan in zip(answers, best, strict=True):
+            if status == 1:
+                assert plan.status == jm.Status.SOLVED
+                np.testing.assert_allclose(u, plan.inputs[0], atol=1e-4)
+
+
 @pytest.mark.parametrize("policy", ["affine", "tube"])
 def test_some_hundred_steps_solve_plans_under_policies(policy, tmp_path):
     """From cold, at random states; the section of the tube has 124 generators, of 0.1 to 4e-13."""
