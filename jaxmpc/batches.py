@@ -131,6 +131,7 @@ def _share(v: Any, *, device: jax.Device, i: int, count: int, batched: bool) -> 
         if own.devices() == {device}:
             return own
         return next(part.data for part in v.addressable_shards if part.device == device)
+    assert not batched or len(v) % count == 0  # see `divisible`
     size = len(v) // count if batched else 0
     return jax.device_put(v[i * size : (i + 1) * size] if batched else v, device)
 

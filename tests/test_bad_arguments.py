@@ -32,10 +32,23 @@ def qp(**changes):
 
 M = mpc()
 BOX = M.states
+LAW = jm.closed_loop.LinearFeedback(M, np.zeros((1, 2)))
 
 
 def fraction(x0s=((0, 0),), **more):
     return jm.feasible.feasible_fraction(M, x0s, **more)
+
+
+class Returns:
+    """A plant of two states whose step returns something else."""
+
+    n, m, state_size = 2, 1, 2
+
+    def __init__(self, value):
+        self.value = value
+
+    def step(self, x, u):
+        return self.value
 
 
 def hiding(array):
@@ -608,6 +621,14 @@ CALLS = [
         "controller: is a str. Give a Controller,",
         lambda: jm.simulate_many("c", S, np.zeros((2, 2)), 3),
     ),
+    (
+        "chunk: 1.5. Give a whole number of",
+        lambda: jm.simulate_many(LAW, S, np.zeros((2, 2)), 3, chunk=1.5),
+    ),
+    (
+        "variations: is a list. Give a dict,",
+        lambda: jm.simulate_many(LAW, S, np.zeros((2, 2)), 3, variations=[1]),
+    ),
     ('parameters: is a dict. Give {"Q":', lambda: jm.tune_weights("m", {}, S, x, 3, 4)),
     ("mpc: is a str. Give a jm.MPC", lambda: jm.tuning.tune_solver("m", np.zeros((3, 2)), 5)),
     (
@@ -850,6 +871,16 @@ def test_arguments_that_do_not_exist_or_are_missing(message, call):
     with pytest.raises(TypeError) as told:
         call()
     assert str(told.value).startswith(message)
+
+
+@pytest.mark.parametrize(
+    ("shape", "value"),
+    [(r"\(3,\)", np.zeros(3)), (r"\(2, 1\)", np.zeros((2, 1))), (r"\(\)", None)],
+)
+def test_a_plant_whose_step_returns_no_state_is_named(shape, value):
+    message = rf"plant: has a step that returns shape {shape}. Return the next state \(2,\)"
+    with pytest.raises(ValueError, match=message):
+        jm.simulate(LAW, Returns(value), x, 3)
 
 
 def test_errors_inside_a_constructor_stay_what_they_are():

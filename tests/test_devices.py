@@ -97,6 +97,27 @@ def check_map():
     assert map_of(np.zeros((0, 2)), devices=2)["label"].shape == (0,)
 
 
+def check_map_of_policies():
+    """Labels under affine policies, of numbers of states that devices do not share equally."""
+    import jaxmpc as jm
+
+    mpc = replace(
+        problem(), horizon=2, disturbance=jm.Box([-0.02, -0.02], [0.02, 0.02]), policy="affine"
+    )
+    x = states(23)
+    find = lambda **options: jm.map_feasible_set(mpc, x, **options).labels
+    names = "label", "status", "start", "plan", "cut_normal", "cut_offset"
+    one = find()
+    assert min(np.sum(one.label == v) for v in (1, -1)) > 3
+    for devices in (2, 3, 4):
+        for chunk in (None, 5, 16):
+            other = find(devices=devices, chunk=chunk)
+            for name in names:
+                np.testing.assert_allclose(
+                    getattr(other, name), getattr(one, name), rtol=1e-12, atol=1e-12
+                )
+
+
 def check_plans():
     """The same bits where each device gets as many states as one did; else to rounding."""
     import jax
@@ -333,7 +354,13 @@ def check_refusals():
 
 
 CHECKS = {name: found for name, found in globals().items() if name.startswith("check_")}
-QUICK = ("check_data_of_other_devices", "check_map", "check_programs", "check_refusals")
+QUICK = (
+    "check_data_of_other_devices",
+    "check_map",
+    "check_map_of_policies",
+    "check_programs",
+    "check_refusals",
+)
 LONG = ("check_weights_by_gauss_newton_steps",)  # whose candidates are those of samples too
 
 

@@ -28,7 +28,7 @@ from jaxmpc.batches import (
     program_bytes,
     work_off,
 )
-from jaxmpc.checks import fail, require_real, require_untraced, whole
+from jaxmpc.checks import fail, require_kind, require_real, require_untraced, whole
 from jaxmpc.closed_loop.estimation import Belief, KalmanFilter, Noise, model_step
 from jaxmpc.closed_loop.feedback import Feedback, LinearFeedback, Plant, first_row, model_of
 from jaxmpc.mpc.plan import Control, checked_aim, checked_array, reference_shapes
@@ -379,7 +379,11 @@ class Loop:
             estimates=state,
             disturbances=disturbances,
         )
-        after = jnp.asarray(self.plant.step(x, u), x.dtype)
+        after = self.plant.step(x, u)
+        if np.shape(after) != x.shape:
+            what = f"has a step that returns shape {np.shape(after)}"
+            fail("plant", what, f"Return the next state {x.shape}")
+        after = jnp.asarray(after, x.dtype)
         if process is not None:
             after = self.state(self.coordinates(after) + process)
         if observer is not None and belief is not None and not self.given.delay:
@@ -484,10 +488,13 @@ def simulate_many(
     cure = "Call it outside jit, vmap and grad; inside them take jax.vmap of jm.simulate"
     for argument, value in {"x0s": x0s, "controller": controller, "plant": plant}.items():
         require_untraced(argument, value, cure)
-    x0s, variations = initial_states(controller, x0s), dict(variations or {})
+    x0s = initial_states(controller, x0s)
+    if variations is not None:
+        cure = "Give a dict, such as {'mass': masses} with one entry for each loop"
+        require_kind("variations", variations, Mapping, cure=cure)
+    variations = dict(variations or {})
     require_variations(plant, variations, len(x0s))
-    if chunk is not None and chunk < 1:
-        fail("chunk", f"{chunk}", "Give a count of at least 1")
+    chunk = None if chunk is None else whole("chunk", chunk, 1)
     devices = chosen_devices(devices)
     aims = (reference, input_reference)
     added = disturbance, output_disturbance, forecast
@@ -499,16 +506,16 @@ def simulate_many(
     _require_own(own, given, controller, steps, len(x0s))
     numbers = None if noise is None else np.arange(len(x0s))
     each = Each(x0s, variations, own, numbers)
-    whole = jax.device_put(arrays((controller, plant, shared)), placement(devices))
+    shares = jax.device_put(arrays((controller, plant, shared)), placement(devices))
     loops = _compiled_loops(int(steps), devices)
 
     def run(part: Each) -> Run:
-        return loops(*whole, jax.device_put(part, placement(devices, True)))
+        return loops(*shares, jax.device_put(part, placement(devices, True)))
 
     size = divisible(min(chunk or len(x0s), len(x0s)), devices)
     while chunk is None and size > count(devices):
         first = jax.tree.map(lambda v, size=size: padded(np.asarray(v)[:size], size), each)
-        program = loops.program(*whole, jax.device_put(first, placement(devices, True)))
+        program = loops.program(*shares, jax.device_put(first, placement(devices, True)))
         if program_bytes(program) <= 0.8 * device_bytes():
             break
         size = divisible(-(-size // 2), devices)

@@ -23,7 +23,19 @@ from jax import Array
 from scipy.spatial import QhullError
 
 from jaxmpc.arrays import Reals, host_array
-from jaxmpc.batches import Compiled, Devices, chosen_devices, default_chunk, over_devices, padded
+from jaxmpc.batches import (
+    Compiled,
+    Devices,
+    chosen_devices,
+    default_chunk,
+    divisible,
+    each_part,
+    first_rows,
+    joined,
+    over_devices,
+    padded,
+    to_host,
+)
 from jaxmpc.checks import fail
 from jaxmpc.feasible import proofs
 from jaxmpc.feasible.hull_labels import (
@@ -353,17 +365,16 @@ def policy_labels(
     found = policy_hull(problem)
     begun, compiled = time.perf_counter(), Compiled.seconds
     chosen = chosen_devices(devices)
-    chunk = min(chunk or default_chunk(64), max(len(points), 1))
+    size = divisible(min(chunk or default_chunk(64), max(len(points), 1)), chosen)
     prepare, ends = compiled_ends(chosen)
-    parts: list[Any] = [(np.zeros(0, np.int8), np.zeros(0, np.int8))]
+
+    def labelled(part: np.ndarray) -> Any:
+        x, usable = prepare.run(part)
+        return to_host(ends.run(compiled_policy_labels(chosen).run(found.hull, x), usable))
+
+    none = np.zeros(0, np.int8), np.zeros(0, np.int8)
     with jax.enable_x64(True):
-        for first in range(0, len(points), chunk):
-            part = points[first : first + chunk]
-            full = part if len(part) == chunk else padded(part, chunk)
-            x, usable = prepare.run(full)
-            done = ends.run(compiled_policy_labels(chosen).run(found.hull, x), usable)
-            parts.append(tuple(np.asarray(v)[: len(part)] for v in done))
-    label, status = (np.concatenate(v) for v in zip(*parts, strict=True))
+        label, status = joined([none, *(p.result for p in each_part(labelled, points, size))])
     verdict = OnDemand(functools.partial(_verdicts, found, points, label, chosen))
     labels = Labels.proved(label, status, verdict.get, POLICY_PROOFS)
     left = labels.undecided[:most]
@@ -379,12 +390,13 @@ def _verdicts(
 ) -> PolicyVerdict:
     """Return the verdicts on points (B, d) by the hull; nothing for others."""
     x = np.where(np.isfinite(x).all(axis=1)[:, None], x, 0.0)
+    whole = padded(x, divisible(len(x), devices))
     with jax.enable_x64(True):
-        w, _, cone, normal, offset = compiled_proofs(devices).run(found.hull, x)
+        proofs = to_host(compiled_proofs(devices).run(found.hull, whole))
+    w, _, cone, normal, offset = first_rows(proofs, len(x))
     problem = found.rays.problem
-    plan, _ = found.split(np.asarray(w))
+    plan, _ = found.split(w)
     none = np.broadcast_to(np.nan, (len(x), *problem.answer_shape))
-    normal, offset, cone = (np.asarray(v) for v in (normal, offset, cone))
     return PolicyVerdict(label, problem.view.states(x), plan, normal, offset, cone, none)
 
 

@@ -210,20 +210,26 @@ def prestabilising_gain(mpc: MPC) -> Any:
 
 
 def _gains_by_step(mpc: MPC) -> Any:
-    """Return the gains (N, m, n) of the regulator of unit weights over the horizon, for a system
-    that differs from step to step; (m, n) zeros where no step grows and none was asked for."""
+    """Return the gains (N, m, n) of the regulator of unit weights in `natural_units` over the
+    horizon, for a system that differs from step to step; (m, n) zeros where no step grows and none
+    was asked for."""
     n, m, N = mpc.system.n, mpc.system.m, mpc.horizon
-    A, B = mpc.system.A, mpc.system.B
+    given: tuple[Any, Any] = arrays((mpc.system.A, mpc.system.B))
+    A, B = given
+    if concrete(A, B):
+        A, B, _ = host_matrices(mpc.system, by_step=True)
     if mpc.prestabilise is None:
         if not concrete(A, B):
             return np.zeros((m, n))
-        A, B, _ = host_matrices(mpc.system, by_step=True)
         if np.abs(np.linalg.eigvals(A)).max() <= 1 + 1e-9:
             return np.zeros((m, n))
-    dtype = floating_dtype((A, B))
-    A, B = (jnp.asarray(v, dtype) for v in jax.lax.stop_gradient((A, B)))
+    dtype = floating_dtype(given)
+    units = natural_units(*(abs(v).reshape(-1, *v.shape[-2:]).max(axis=0) for v in (A, B)))
+    A, B = (v.astype(dtype) for v in jax.lax.stop_gradient(given))
+    units = jax.tree.map(lambda v: jnp.asarray(v, dtype), units)
     Q, R = (jnp.broadcast_to(jnp.eye(k, dtype=dtype), (N + 1, k, k)) for k in (n, m))
-    return _regulator(Q, R[:-1], A, B)
+    gains = _regulator(Q, R[:-1], *units.system(A, B))
+    return jnp.where(jnp.all(jnp.isfinite(gains)), units.gain(gains), 0.0)
 
 
 @compiled_lightly(0)

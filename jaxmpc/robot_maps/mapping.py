@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxmpc.arrays import Reals, host_array
 from jaxmpc.batches import Compiled, Part, default_chunk, first_rows, padded, slices, work_off
-from jaxmpc.checks import fail, require_shape
+from jaxmpc.checks import fail, require_shape, whole
 from jaxmpc.closed_loop.robot_controller import RobotController, robot_mpc
 from jaxmpc.closed_loop.simulation import simulate_many
 from jaxmpc.feasible.map import FeasibleSetMap
@@ -177,9 +177,8 @@ class RobotSetting:
 
     def chunk(self, chunk: int | None = None) -> int:
         """Return how many loops run at once."""
-        if chunk is not None and (isinstance(chunk, bool) or chunk < 1):
-            fail("chunk", f"{chunk}", "Give a count of at least 1")
-        return min(default_chunk() // 32 if chunk is None else int(chunk), len(self.x0s))
+        chunk = default_chunk() // 32 if chunk is None else whole("chunk", chunk, 1)
+        return min(chunk, len(self.x0s))
 
     def parts(
         self,

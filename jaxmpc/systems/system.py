@@ -119,11 +119,13 @@ class LinearSystem:
         return _labels("u", self.m, self.input_names, self.input_units)
 
     def step(self, x: Reals, u: Reals) -> jax.Array:
-        """Return A x + B u + c for x (n,) and u (m,), computed in the dtype of x."""
+        """Return A x + B u + c for x (n,) and u (m,), computed in the dtype of x; of a system that
+        differs from step to step the first step."""
         x = jnp.asarray(x)
-        A, B = jnp.asarray(self.A, x.dtype), jnp.asarray(self.B, x.dtype)
-        after = matmul(A, x) + matmul(B, jnp.asarray(u, x.dtype))
-        return after if self.c is None else after + jnp.asarray(self.c, x.dtype)
+        parts = (self.A, 2), (self.B, 2), (0.0 if self.c is None else self.c, 1)
+        every = ((jnp.asarray(v, x.dtype), axes) for v, axes in parts)
+        A, B, c = (v[0] if v.ndim > axes else v for v, axes in every)
+        return matmul(A, x) + matmul(B, jnp.asarray(u, x.dtype)) + c
 
     def validate(self, steps: int | None = None) -> None:
         """Raise ValueError for wrong shapes and entries that are not finite.

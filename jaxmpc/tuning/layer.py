@@ -6,7 +6,7 @@ positive definite, and so on. The derivative of a plan is that of the solution o
 (Amos et al. 2018, Agrawal et al. 2019, NeurIPS), see `ADMM.differentiate` and `ADMM.smoothing`.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import reduce
 from typing import Any
@@ -82,7 +82,12 @@ class MPCLayer:
             fail("terminal_weight", f"{terminal_weight!r}", 'Give "given" or "lqr"')
         if not concrete(mpc):
             fail("mpc", "holds traced arrays", "Make the layer outside jax.jit, and learn these")
+        if not isinstance(learn, Iterable) or not all(isinstance(name, str) for name in learn):
+            fail("learn", f"{learn!r}", 'Give names of what is learned, such as ("Q", "R")')
         names = [learn] if isinstance(learn, str) else list(learn)
+        for i, name in enumerate(names):
+            if same := [other for other in names[:i] if _path(other) == _path(name)]:
+                fail("learn", f"names {name!r} as {same[0]!r} already", "Leave one of the two out")
         given = learn if isinstance(learn, Mapping) else {}
         parts = {name: _at(mpc, name) for name in names}
         found = {n: given[n] if given else _parameter(n, value) for n, value in parts.items()}
@@ -172,7 +177,9 @@ def _at(mpc: MPC, name: str) -> np.ndarray:
     except AttributeError:
         fail("learn", f"{name!r} is no field of the problem", f"Give names {known}")
     field = getattr(part, "__dataclass_fields__", {}).get(last)
-    if field is not None and field.metadata.get("static"):
+    if field is None:  # a property, or an attribute of an array
+        fail("learn", f"{name!r} is no field of the problem", f"Give names {known}")
+    if field.metadata.get("static"):
         fail("learn", f"{name!r} is a constant of the problem", f"Give names {known}")
     if value is None:
         fail("learn", f"{name!r} is None in the problem", "Give it a value to start from")

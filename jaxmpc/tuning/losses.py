@@ -8,7 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxmpc.checks import fail, require_symmetric_psd
+from jaxmpc.checks import (
+    fail,
+    number,
+    require_finite,
+    require_kind,
+    require_real,
+    require_shape,
+    require_symmetric_psd,
+)
 from jaxmpc.closed_loop.simulation import Run
 from jaxmpc.pytrees import record
 from jaxmpc.qp.linalg import matmul
@@ -33,7 +41,7 @@ class ClosedLoopLoss:
     reference: r (n,), or at least T rows; None for zero.
     input_reference: s (m,), or at least T rows; None for zero.
     limits: Box or Polytope of x; excess_i is by how much row i is violated, in its unit, of a Box
-    as a fraction of its half-width (1 where infinite).
+    as a fraction of its half-width (1 where that is 0 or infinite).
     violation: weight ≥ 0 of the excess, an exact penalty: with a large enough weight limits are
     kept wherever they can be. settling: weight ≥ 0 of the time to settle.
     band (n,): the size of what counts as settled, needed where settling > 0.
@@ -65,12 +73,18 @@ class ClosedLoopLoss:
             require_symmetric_psd(name, W)
             object.__setattr__(self, name, W)
         for name in ("violation", "settling"):
-            if not 0 <= getattr(self, name) < np.inf:
-                fail(name, f"{getattr(self, name)}", "Give a weight ≥ 0")
+            number(name, getattr(self, name), 0, "Give a weight ≥ 0")
+            require_finite(name, getattr(self, name))
+        if self.limits is not None:
+            require_kind("limits", self.limits, Box, Polytope)
         if self.settling and self.band is None:
             fail("band", "is None", "Give the size (n,) of what counts as settled")
+        if self.band is not None:
+            require_real("band", self.band)
         if self.band is not None and not np.all(np.asarray(self.band) > 0):
             fail("band", f"{self.band}", "Give positive numbers")
+        if self.band is not None and np.ndim(self.band) > 1:
+            fail("band", f"shape {np.shape(self.band)}", "Give (n,), one number for each state")
         if not self.softness > 0:
             fail("softness", f"{self.softness}", "Give a positive number")
 
@@ -82,9 +96,22 @@ class ClosedLoopLoss:
     def terms(self, run: Run) -> dict[str, Array]:
         """Return what the loss of one run is the sum of: tracking, effort, and violation and
         settling where these have a weight."""
-        T, dtype = run.inputs.shape[0], run.inputs.dtype
+        if run.inputs.ndim != 2:
+            what = f"has inputs of shape {run.inputs.shape}"
+            fail("run", what, "Give one loop; jax.vmap(loss)(runs) is that of many")
+        (T, m), dtype = run.inputs.shape, run.inputs.dtype
         x = self._coordinates(run)
-        e, v = x - self._aim(self.reference, T + 1), run.inputs - self._aim(self.input_reference, T)
+        n = x.shape[1]
+        require_shape("loss.Q", self.Q, (n, n), "One weight for each state")
+        require_shape("loss.R", self.R, (m, m), "One weight for each input")
+        if self.band is not None and (n > 1 or np.ndim(self.band)):
+            require_shape("loss.band", self.band, (n,), "One number for each state")
+        if self.limits is not None:
+            self.limits.validate("loss.limits", n)
+        r, s = self._aim("reference", T, n), self._aim("input_reference", T, m)
+        if r.ndim == 2:
+            r = jnp.concatenate([r, r[-1:]])[: T + 1]
+        e, v = x - r, run.inputs - (s[:T] if s.ndim == 2 else s)
         square = lambda v, W: jnp.sum(v * matmul(v, jnp.asarray(W, dtype)))
         terms = {"tracking": square(e[:-1], self.Q) / T, "effort": square(v, self.R) / T}
         if self.limits is not None and self.violation:
@@ -110,15 +137,20 @@ class ClosedLoopLoss:
         """Return the states in the coordinates of the problem, (T+1, n)."""
         return run.states if self.plant is None else jax.vmap(self.plant.coordinates)(run.states)
 
-    @staticmethod
-    def _aim(reference: Any, length: int) -> Any:
-        """Return a reference for `length` samples, its last row again where it is one short."""
+    def _aim(self, name: str, samples: int, size: int) -> Array:
+        """Return a reference, (size,) or at least so many rows of it."""
+        reference = getattr(self, name)
         if reference is None:
-            return 0.0
+            return jnp.zeros(size)
+        require_real(f"loss.{name}", reference)
         reference = jnp.asarray(reference)
-        if reference.ndim == 2 and len(reference) < length:
-            reference = jnp.concatenate([reference, reference[-1:]])
-        return reference[:length] if reference.ndim == 2 else reference
+        shape = reference.shape
+        if reference.ndim == 2 and shape[1] == size and shape[0] >= samples:
+            return reference
+        if shape != (size,) and (shape or size > 1):
+            cure = f"Give ({size},), or a row for each of the {samples} samples"
+            fail(f"loss.{name}", f"shape {shape}", cure)
+        return reference
 
 
 @record

@@ -107,9 +107,9 @@ class ClosedLoopObjective:
 
     def losses(self, run: Run, varied: dict[str, Array]) -> tuple[Array, dict[str, Array]]:
         """Return the loss of each of the loops (B, …), and of several losses each."""
-        found = jax.vmap(self.loss)(run)
         if not isinstance(self.loss, SeveralLosses):
-            return found, {}
+            return jax.vmap(partial(_number, self.loss))(run), {}
+        found = jax.vmap(self.loss)(run)
         terms = {f"{TERM}{name}": found[:, i] for i, name in enumerate(self.loss.functions)}
         return jnp.sum(varied[MIX] * found, axis=1), terms
 
@@ -413,3 +413,12 @@ def means(aux: dict[str, np.ndarray], weights: np.ndarray) -> dict[str, float]:
     names = ("unsolved", "infeasible", "fallback", "violation", *terms)
     found = {name: float(np.mean(aux[name][used])) if used.any() else np.nan for name in names}
     return {**found, "excluded": float(np.sum(~used))}
+
+
+def _number(loss: Callable[[Run], Any], run: Run) -> Array:
+    """Return the loss of one run; raise ValueError where it is not one number."""
+    found = loss(run)
+    if found is None or np.shape(found) != ():
+        what = "None" if found is None else f"shape {np.shape(found)}"
+        fail("loss", f"returns {what}", "Return one number of a Run; jm.SeveralLosses has several")
+    return jnp.asarray(found)

@@ -177,6 +177,10 @@ def prepared(
             cure = f"Add it, or use some of {', '.join(initial)}"
             fail("parameters", f"have no {error.args[0]!r}, which make_mpc asks for", cure)
         raise
+    for name, function in (("loss", loss), ("design_loss", design_loss)):
+        if function is not None and not callable(function):
+            of = "a Run" if name == "loss" else "an MPC"
+            fail(name, f"is a {type(function).__name__}", f"Give a function of {of}")
     if loss is None:
         aims = (aim(initial) if callable(aim) else aim for aim in (reference, input_reference))
         loss = _default_loss(controller, plant, *aims)

@@ -383,7 +383,7 @@ def test_bad_loops_are_named(pendulum, linear_mpc):
         (lambda: many(law, PLANT, np.zeros((4, 3)), 5), r"x0s: shape .4, 3.. Give \(B, 2\)"),
         (lambda: many(law, PLANT, x0s, 0), "steps: 0. Give a whole number"),
         (lambda: many(law, PLANT, x0s, 2.5), "steps: 2.5"),
-        (lambda: many(law, PLANT, x0s, 5, chunk=0), "chunk: 0. Give a count of at least 1"),
+        (lambda: many(law, PLANT, x0s, 5, chunk=0), "chunk: 0. Give a whole number"),
         (lambda: many(law, PLANT, x0s, 5, reference=[1.0]), r"reference: shape \(1,\). Give"),
         (lambda: many(law, PLANT, x0s, 5, input_reference=np.zeros((5, 1))), "input_reference: sh"),
         (

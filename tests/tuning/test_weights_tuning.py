@@ -367,6 +367,9 @@ def test_loss_in_closed_form(x64):
         ({"variations": {"payload": np.zeros(16)}}, "variations"),
         ({"make": lambda v: v["Q"]}, "make_mpc.*Return a jm.MPC"),
         ({"loss": lambda run: run.cost}, r"loss.*\(8,\)"),
+        ({"loss": lambda run: None}, "loss: returns None. Return one number"),
+        ({"loss": "a"}, "loss: is a str. Give a function of a Run"),
+        ({"design_loss": "a"}, "design_loss: is a str. Give a function of an MPC"),
         ({"steps": 0}, "steps"),
     ],
 )
@@ -385,11 +388,34 @@ def test_bad_arguments_before_any_compile(more, message, monkeypatch):
         ({"settling": 1.0}, "band.*None"),
         ({"settling": 1.0, "band": [0.0, 1.0]}, "band"),
         ({"softness": 0.0}, "softness"),
+        ({"violation": "a"}, "violation: 'a'|violation: entries|violation: is"),
+        ({"limits": [[-1.0], [1.0]]}, "limits: is a list. Give a jm.Box or jm.Polytope"),
+        ({"band": np.ones((2, 2))}, r"band: shape \(2, 2\)"),
+        ({"Q": np.eye(3)}, r"loss.Q: shape \(3, 3\)"),
+        ({"R": [1.0, 1.0]}, r"loss.R: shape \(2, 2\)"),
+        (
+            {"reference": 1.0},
+            r"loss.reference: shape \(\). Give \(2,\), or a row",
+        ),
+        ({"reference": np.ones(1)}, r"loss.reference: shape \(1,\)"),
+        ({"reference": np.ones((4, 1))}, r"loss.reference: shape \(4, 1\)"),
+        ({"reference": np.ones((2, 2))}, r"loss.reference: shape \(2, 2\)"),
+        ({"input_reference": np.ones((2, 1))}, r"loss.input_reference: shape \(2, 1\)"),
+        ({"settling": 1.0, "band": [1.0]}, r"loss.band: shape \(1,\)"),
+        ({"limits": jm.Box([-1.0] * 3, [1.0] * 3)}, "loss.limits"),
     ],
 )
 def test_bad_losses(more, message):
+    run = run_of(jnp.zeros((4, 2)), jnp.zeros((3, 1)))
     with pytest.raises(ValueError, match=message):
-        ClosedLoopLoss(**{"Q": [1.0, 1.0], "R": [1.0], **more})
+        ClosedLoopLoss(**{"Q": [1.0, 1.0], "R": [1.0], **more})(run)
+
+
+def test_a_loss_is_of_one_loop():
+    run = run_of(jnp.zeros((5, 4, 2)), jnp.zeros((5, 3, 1)))
+    with pytest.raises(ValueError, match=r"run: has inputs of shape \(5, 3, 1\). Give one"):
+        LOSS(run)
+    assert jax.vmap(LOSS)(run).shape == (5,)
 
 
 @pytest.mark.slow
