@@ -197,6 +197,16 @@ def test_delayed_loops_with_filter_and_moving_references(kind):
     np.testing.assert_allclose(late.cost, want.cost, atol=1e-7)
 
 
+def test_a_delay_is_predicted_by_the_first_of_systems_that_differ():
+    """Three times the same one: the loop is that of the system."""
+    A, B = 0.9 * np.eye(2), [[0.1], [1.0]]
+    runs = []
+    for system in (jm.LinearSystem(A, B), jm.LinearSystem(np.stack([A] * 3), B)):
+        controller = jm.Controller(jm.MPC(system, np.eye(2), [[1.0]], 3, inputs=jm.Box(-1, 1)))
+        runs.append(jm.simulate(controller, jm.LinearSystem(A, B), [1.0, 0.0], 3, delay=1))
+    np.testing.assert_allclose(runs[1].states, runs[0].states, atol=1e-6)
+
+
 @pytest.mark.slow
 def test_a_robots_own_model_predicts_its_delay():
     """Inside its limits the predictor is the plant: the delayed loop of a robot far from where its

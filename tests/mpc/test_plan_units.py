@@ -395,3 +395,26 @@ def test_plans_near_a_set_point_are_those_near_zero():
             np.testing.assert_allclose(
                 plan.inputs - u, moved.inputs, atol=1e-6 * abs(off).max() + 1e-11
             )
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_unstable_systems_that_differ_from_step_to_step(dtype):
+    """Prestabilised, in units up to 2^40 apart: the plan of the inputs themselves."""
+    A = np.array([[[1.2, 0.1], [0, 0.9]], [[1.3, 0], [0.2, 0.9]], [[1.1, 0.1], [0, 1.2]]])
+    B, Q = np.array([[1.0, 2.0], [0.5, -1.0]]), np.eye(2)
+    with jax.enable_x64(dtype == "float64"):
+        plans = []
+        for k in ([0, 0], [12, 12], [-20, 20], [-20, -20]):
+            x = 2.0 ** np.array(k)
+            system = jm.LinearSystem(x[:, None] * A / x, x[:, None] * B)
+            for prestabilise in (None, False):
+                mpc = jm.MPC(
+                    system, Q / x / x[:, None], np.eye(2), 3, inputs=jm.Box([-1, -1], [1, 1]),
+                    prestabilise=prestabilise,
+                )  # fmt: skip
+                mpc = jax.tree.map(lambda v: np.asarray(v, dtype), mpc)
+                plans.append(jm.solve(mpc, np.asarray(x * [0.7, -0.4], dtype)))
+        for plan in plans:
+            assert plan.status == jm.Status.SOLVED
+            np.testing.assert_allclose(plan.inputs, plans[1].inputs, atol=1e-4)
+            np.testing.assert_allclose(plan.cost, plans[1].cost, rtol=1e-4)
