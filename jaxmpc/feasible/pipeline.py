@@ -220,16 +220,7 @@ class Labels:
             sum(part.run_seconds for part in parts),
         )
 
-    def first(self, count: int) -> "Labels":
-        """Return the labels of the first `count` points."""
-
-        def head(proof: OnDemand[np.ndarray]) -> OnDemand[np.ndarray]:
-            return OnDemand(lambda: proof.get()[:count])
-
-        proofs = {name: head(proof) for name, proof in self.proofs.items()}
-        return replace(self, label=self.label[:count], status=self.status[:count], proofs=proofs)
-
-    def rows(self, index: np.ndarray) -> "Labels":
+    def rows(self, index: np.ndarray | slice) -> "Labels":
         """Return the labels of the points at these indices, with their proofs."""
 
         def some(proof: OnDemand[np.ndarray]) -> OnDemand[np.ndarray]:
@@ -404,11 +395,11 @@ class Pipeline:
             verdict = OnDemand(functools.partial(self.hull_verdict, x))
             label, status = to_host(found)
             labels = Labels.proved(label, status, verdict.get)
-        labels = labels.first(len(points))
+        labels = labels.rows(slice(len(points)))
         left = labels.undecided
         for stage in self.stages:
             for where in self.batches(left):
-                more = stage(padded(points[where], self.batch)).first(len(where))
+                more = stage(padded(points[where], self.batch)).rows(slice(len(where)))
                 labels = labels.changed(where, more.label, more.status, more.proofs)
             left = left[labels.label[left] == 0]
         left = left[: self.share]
@@ -452,7 +443,8 @@ class Pipeline:
                 solved = [_candidate(program, rows, theta) for theta in points[where]]
                 candidates = [padded(np.array(v), self.batch) for v in zip(*solved, strict=True)]
                 x = padded(points[where], self.batch)
-                more = self.decided(_run(check, self.exact, rows, x, *candidates)).first(len(where))
+                more = self.decided(_run(check, self.exact, rows, x, *candidates))
+                more = more.rows(slice(len(where)))
                 labels = labels.changed(where, more.label, more.status, more.proofs)
         return labels
 

@@ -56,7 +56,6 @@ from jaxmpc.feasible.pipeline import (
     compiled_ends,
 )
 from jaxmpc.feasible.policy_problem import (
-    HalfSpace,
     PolicyProblem,
     directions,
     problem_of,
@@ -167,7 +166,7 @@ class PolicyRays:
         width = problem.causal.shape[1]
         each = [problem.lifted.multipliers(y, width) for y in multipliers]
         cuts = [problem.exact_rows.cut(*parts, problem.causal) for parts in each]
-        cut = HalfSpace(*(np.array(v) for v in zip(*cuts, strict=True)))
+        cut = Cut(*(np.array(v) for v in zip(*cuts, strict=True)))
         with np.errstate(invalid="ignore"):
             extra = np.where(cut.w == 0, 0.0, cut.w * self.reach).sum(axis=1)
         offsets = np.nextafter(cut.b + extra * (1 + 1e-12), np.inf)
@@ -183,7 +182,7 @@ class PolicyRays:
             w=w,
             normals=cut.a,
             offsets=offsets,
-            cuts=Cut(*cut),  # type: ignore[arg-type]
+            cuts=cut,
         )
 
 

@@ -37,6 +37,7 @@ from jaxmpc.checks import fail, require_kind
 from jaxmpc.feasible.hard_constraints import Axes, augmented_dynamics, hard_blocks, make_view
 from jaxmpc.feasible.plan_polytope import PlanPolytope
 from jaxmpc.feasible.problem import FeasibilityProblem, as_box
+from jaxmpc.feasible.proofs import Cut
 from jaxmpc.mpc.policy_rows import require_free_inputs, require_generators, tube_section
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.tightening import feedback_gain, without_disturbance
@@ -481,14 +482,6 @@ class PolicyPrograms:
         return np.array([-sides[1] - margin, sides[0] + margin]), np.array(y)
 
 
-class HalfSpace(NamedTuple):
-    """a'θ ≤ b + w'|θ| for every feasible θ, as `proofs.Cut`, in NumPy."""
-
-    a: np.ndarray
-    b: np.ndarray
-    w: np.ndarray
-
-
 class ExactRows:
     """The rows as integers over 2^e, for proofs without rounding."""
 
@@ -517,9 +510,7 @@ class ExactRows:
                 return False
         return True
 
-    def cut(
-        self, above: np.ndarray, below: np.ndarray, Q: np.ndarray, causal: np.ndarray
-    ) -> HalfSpace:
+    def cut(self, above: np.ndarray, below: np.ndarray, Q: np.ndarray, causal: np.ndarray) -> Cut:
         """Return the half-space a'θ ≤ b + w'|θ| that multipliers of the rows imply, valid for every
         feasible θ; b = ∞ where they imply none.
 
@@ -528,7 +519,7 @@ class ExactRows:
         below = np.where([v is None for v in self.lower], 0.0, below)
         largest = max(above.max(initial=0.0), below.max(initial=0.0))
         if not (np.isfinite(largest) and largest > 0 and np.all(np.isfinite(Q))):
-            return HalfSpace(np.zeros(self.F.shape[1]), np.array(np.inf), np.zeros(self.F.shape[1]))
+            return Cut(np.zeros(self.F.shape[1]), np.array(np.inf), np.zeros(self.F.shape[1]))
         unit = 2.0 ** np.ceil(np.log2(largest))
         ints = lambda v: np.array(
             [int(x) for x in np.rint(v / unit * 2.0**BITS).ravel()], object
@@ -561,7 +552,7 @@ class ExactRows:
             near = float(np.nextafter(near, np.inf))
         if not (np.any(normal != 0) or near < 0):
             near = np.inf
-        return HalfSpace(normal, np.array(near), np.nextafter(off, np.inf) * (off > 0))
+        return Cut(normal, np.array(near), np.nextafter(off, np.inf) * (off > 0))
 
 
 class _Whole(NamedTuple):

@@ -76,11 +76,12 @@ class Verdict:
 
 
 class Cut(NamedTuple):
-    """a'θ ≤ b + w'|θ| for every feasible θ: a (d,), b, w (d,) ≥ 0, which covers rounding."""
+    """a'θ ≤ b + w'|θ| for every feasible θ: a (d,), b, w (d,) ≥ 0, which covers rounding; in JAX,
+    or in NumPy."""
 
-    a: Array
-    b: Array
-    w: Array
+    a: Any
+    b: Any
+    w: Any
 
 
 def gamma(terms: int) -> float:

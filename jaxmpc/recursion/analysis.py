@@ -51,9 +51,9 @@ from jaxmpc.recursion.proofs import (
 from jaxmpc.recursion.report import RecursionReport, SmallestHorizon
 from jaxmpc.recursion.time_budget import LABELS, PLANS, PROOFS, Budget
 
-# Where to look for lost states beside a worst vertex: so far towards the centre.
 # Of data that differ from step to step.
 SAME = "recursive feasibility is about the same problem at every time step"
+# Where to look for lost states beside a worst vertex: so far towards the centre.
 NEAR_THE_WORST = np.array([1e-6, 1e-4, 1e-3, 1e-2])
 
 

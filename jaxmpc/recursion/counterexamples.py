@@ -186,7 +186,7 @@ def labelled(law: Law, problem: FeasibilityProblem, states: np.ndarray) -> Label
     """Return the labels of states (B, p or more columns), in programs of the law's shape."""
     padded = law.filled(states[:, : problem.dimension])
     fmap: FeasibleSetMap = map_points(problem, padded, chunk=law.chunk)
-    return fmap.labels.first(len(states))
+    return fmap.labels.rows(slice(len(states)))
 
 
 def closed_loops(

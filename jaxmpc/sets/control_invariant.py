@@ -112,7 +112,8 @@ def maximal_control_invariant_set(
     if margin < -FLAT:
         short = f" (the best misses them by {-margin:.3g} of their size)"
         why = "empty: no equilibrium x = A x + B u + c lies within the limits"
-        end = _End(_empty(step.n), 0, f"{why}{'' if margin == -np.inf else short}", exact=True)
+        why = why if margin == -np.inf else why + short
+        end = _End(Polytope.empty(step.n), 0, why, exact=True)
     else:
         end = _recursion(step, X, max_iterations, tolerance)
     inner, gap, reason = end.C, 0.0, end.why
@@ -157,7 +158,7 @@ def _recursion(step: OneStep, X: Polytope, max_iterations: int, tolerance: float
             if before.is_empty() or following.is_empty():
                 against = "" if step.W is None else " against every disturbance"
                 why = f"empty: from no state do the limits hold for {k + 1} steps{against}"
-                return _End(_empty(step.n), k + 1, why, exact=True)
+                return _End(Polytope.empty(step.n), k + 1, why, exact=True)
             cut = largest_cut(before, C, enough=_CUT)
             # Convergence without end makes each cut a fraction of the last; an end makes it 0.
             if cut <= ROUNDING and last > _CUT:
@@ -184,10 +185,6 @@ def _recursion(step: OneStep, X: Polytope, max_iterations: int, tolerance: float
     return _End(C, k, "max_iterations is reached", cut=cut)
 
 
-def _empty(n: int) -> Polytope:
-    return Polytope(np.zeros((1, n)), np.array([-1.0]))
-
-
 def _described(
     step: OneStep, end: _End, center: np.ndarray, inner: Polytope | None, gap: float
 ) -> tuple[Polytope, float, str]:
@@ -202,10 +199,9 @@ def _described(
         return inner, gap, reason
     reason = f"outer bound: {end.why}; no control invariant set with volume was found in it"
     if step.W is not None:
-        return _empty(step.n), gap, reason
-    x, identity = center[: step.n], np.eye(step.n)
-    point = Polytope(np.vstack([identity, -identity]), np.r_[x, -x])
-    return point, gap, f"{reason}, so the set returned is an equilibrium alone"
+        return Polytope.empty(step.n), gap, reason
+    x = center[: step.n]
+    return Box(x, x).to_polytope(), gap, f"{reason}, so the set returned is an equilibrium alone"
 
 
 def _equilibrium(step: OneStep, X: Polytope) -> tuple[np.ndarray, float]:

@@ -383,7 +383,8 @@ class Polytope(LinearSet):
         own, others, C = polyhedra.independent_rows(M)
         if hull.equal.any():
             if not hull.basis.shape[1]:
-                return _point(M @ hull.shift + t)
+                point = M @ hull.shift + t
+                return Box(point, point).to_polytope()
             return Polytope(hull.G, hull.g).image(M @ hull.basis, M @ hull.shift + t)
         H, h = np.zeros((0, k)), np.zeros(0)
         if len(own):
@@ -1087,12 +1088,6 @@ class Zonotope(LinearSet):
             wanted = f"({center[0]}, m)"
             fail(f"{argument}.generators", f"shape {G} is not {wanted}", "Give one a column")
         require_dimension(argument, center[0], dimension)
-
-
-def _point(x: np.ndarray) -> Polytope:
-    """Return the set {x}."""
-    n = len(x)
-    return Polytope(np.vstack([np.eye(n), -np.eye(n)]), np.concatenate([x, -x]))
 
 
 def _require_summand(set_: ConvexSet, other: Any) -> None:

@@ -125,7 +125,7 @@ class OneStep:
         if states is not None:
             both = both.intersect(states.preimage(np.eye(n, n + k)))
         if both.is_empty():
-            return Polytope(np.zeros((1, n)), np.array([-1.0]))
+            return Polytope.empty(n)
         return tidy(both.project(range(n)) if k else Polytope(*both.half_spaces()))
 
     @staticmethod
@@ -213,12 +213,11 @@ def _plus_segment(T: Polytope, b: np.ndarray, lower: float, upper: float) -> Pol
 def tidy(polytope: Polytope) -> Polytope:
     """Return the same set with irredundant unit rows; 0'x <= -1 if empty, 0'x <= 1 if all of
     R^n."""
-    zero = np.zeros((1, polytope.dimension))
     if polytope.is_empty():
-        return Polytope(zero, np.array([-1.0]))
+        return Polytope.empty(polytope.dimension)
     G, g = polytope.unit_rows()
     if not len(G):
-        return Polytope(zero, np.array([1.0]))
+        return Polytope(np.zeros((1, polytope.dimension)), np.array([1.0]))
     try:
         return Polytope(*irredundant_rows("Polytope", G, g))
     except Flat:
