@@ -140,16 +140,17 @@ def sizes_of_code(controller: Controller) -> tuple[jax.Array, jax.Array]:
     small. So they are at the origin too, where all terms vanish.
 
     A row has the size of its nearest bound that is not 0. In the coordinates of ADMM, where the
-    Hessian is the identity, states and gradients are lengths alike: the median over the rows of how
-    far these bounds are is the size of the variables, and of rows without such a bound.
+    Hessian is the identity, states and gradients are lengths alike: the median over the rows of the
+    plan of how far these bounds are is the size of the variables, and of rows without one.
     """
     c, factor = controller.condensed, controller.factor
     assert c is not None and factor is not None
     ends = jnp.abs(jnp.stack([c.lower, c.upper]))
     nearest = jnp.min(jnp.where((ends > 0) & jnp.isfinite(ends), ends, jnp.inf), axis=0)
-    length = jnp.nanmedian(
-        jnp.where(jnp.isfinite(nearest) & (factor.E > 0), nearest * factor.E, jnp.nan)
-    )
+    far = jnp.where(jnp.isfinite(nearest) & (factor.E > 0), nearest * factor.E, jnp.nan)
+    if isinstance(c, PolicyCondensed):  # what a policy answers costs next to nothing
+        far = far[: c.copies * sum(len(steps) * size for _, steps, size in c.layout)]
+    length = jnp.nanmedian(far)
     length = jnp.where(jnp.isfinite(length), length, 0.0)
     rows = jnp.where(jnp.isfinite(nearest), nearest, length * factor.row_norms)
     return rows, length / jnp.sum(jnp.abs(factor.T), axis=1)

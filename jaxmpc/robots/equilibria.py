@@ -408,7 +408,7 @@ def lacking(robot: RobotDescription, rest: Rest) -> str:
         i = int(np.argmax(rest.over))
         return f"{robot.input_names[i]} is {rest.over[i]:.3g} beyond its limit"
     missing = np.abs(rest.missing)
-    dof = int(np.argmax(missing / rest.sizes))
+    dof = int(np.argmax(np.where(missing > BALANCED * rest.sizes, missing, 0.0)))
     return f"{missing[dof]:.3g} are missing at {robot.state_names[dof]}"
 
 

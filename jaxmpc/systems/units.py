@@ -11,14 +11,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmpc.qp.linalg import namespace, solve
+from jaxmpc.qp.linalg import namespace
 
-# Entries this many times smaller than 1 in the units found so far are rounding in place of zeros.
-_ROUNDING = 2.0**-40
-# So often the fit is repeated without them.
-_AGAIN = 2
-# Beside equations of weight 1: decides what no entry does.
-_RIDGE = 1e-5
+# Entries this much smaller than others of their row and of their column are rounding: couplings
+# of 1e-16 one way and 1 the other way are of 1e-8 both ways.
+_ROUNDING = 2.0**-25
+_SWEEPS = 40
 # Units are between 2^-_FARTHEST and its inverse.
 _FARTHEST = 100
 
@@ -49,48 +47,57 @@ class Units(NamedTuple):
 
 
 def natural_units(A: Any, B: Any, Q: Any = None, R: Any = None) -> Units:
-    """Return units in which A (n, n), B (n, m) and the diagonals of Q and R, if given, are about 1.
+    """Return units in which A (n, n), B (n, m) and the diagonals of Q and R are balanced.
 
-    The least squares fit of the logarithms of all entries but zeros (Curtis & Reid 1972, J. Inst.
-    Maths Applics 10) and those that are rounding. In NumPy, or traced: then constants to
-    derivatives.
+    Of each state the largest entry by which it acts on other states and on the cost is made equal
+    to the largest by which it is acted on; inputs and the cost have a largest entry of 1 (Osborne
+    1960, J. ACM 7(4), in the maximum norm). Small entries have no influence. In NumPy, or traced:
+    then constants to derivatives.
     """
     xp = namespace((A, B, Q, R))
     if xp is jnp:
         A, B, Q, R = jax.lax.stop_gradient((A, B, Q, R))
     (n, m), dtype = B.shape, A.dtype
-    diagonals = (xp.zeros(k) if W is None else xp.diagonal(W) for W, k in ((Q, n), (R, m)))
-    sizes = [xp.abs(M) for M in (A * (1 - np.eye(n)), B, *diagonals)]
-    logs = [xp.log2(xp.where(size > 0, size, 1)) for size in sizes]
-    every = Units(xp.ones(n, dtype), xp.ones(m, dtype), xp.ones((), dtype))
-    tiny = xp.finfo(dtype).tiny
+    others, B, itself = xp.abs(A) * (1 - np.eye(n)), xp.abs(B), xp.abs(xp.diagonal(A))
+    roots = [
+        xp.zeros(k, dtype) if W is None else xp.sqrt(xp.abs(xp.diagonal(W)))
+        for W, k in ((Q, n), (R, m))
+    ]
 
-    def fit(least: Any, units: Units) -> Units:
-        x, u, v = units
-        scaled = *units.system(*sizes[:2]), sizes[2] * x * (x / v), sizes[3] * u * (u / v)
-        a, b, q, r = weights = [(size > least).astype(dtype) for size in scaled]
-        la, lb, lq, lr = (w * log for w, log in zip(weights, logs, strict=True))
-        # Normal equations of log2|A_ij| + x_j − x_i = 0, log2|B_ij| + u_j − x_i = 0,
-        # log2 Q_ii + 2 x_i − v = 0 and log2 R_jj + 2 u_j − v = 0.
-        xx = xp.diag(a.sum(0) + a.sum(1) + b.sum(1) + 4 * q) - a - a.T
-        uu = xp.diag(b.sum(0) + 4 * r)
-        xv, uv = -2 * q[:, None], -2 * r[:, None]
-        vv = (q.sum() + r.sum())[None, None]
-        rows = [xx, -b, xv], [-b.T, uu, uv], [xv.T, uv.T, vv]
-        G = xp.concatenate([xp.concatenate(row, axis=1) for row in rows], axis=0)
-        by_x, by_u = la.sum(1) - la.sum(0) + lb.sum(1) - 2 * lq, -lb.sum(0) - 2 * lr
-        g = xp.concatenate([by_x, by_u, (lq.sum() + lr.sum())[None]])
-        G = G + _RIDGE * xp.eye(n + m + 1, dtype=dtype)
-        z = (np.linalg.solve if xp is np else solve)(G, g[:, None])[:, 0]
-        z = xp.ldexp(xp.ones_like(z), xp.clip(xp.round(z), -_FARTHEST, _FARTHEST).astype(int))
-        return Units(z[:n], z[n:-1], z[-1])
+    def logs_of(*parts: Any) -> tuple[Any, Any]:
+        """Return log2 of the largest entries of rows, and where there are any but zeros."""
+        most = xp.max(xp.concatenate(parts, axis=1), axis=1, initial=0.0)
+        return xp.log2(xp.where(most > 0, most, 1)), most > 0
 
-    units = fit(tiny, every)
-    if xp is np:
-        for _ in range(_AGAIN):
-            units = fit(_ROUNDING, units)
-        return units
-    return jax.lax.fori_loop(0, _AGAIN, lambda _, units: fit(_ROUNDING, units), units)
+    def sweep(parts: Any, logs: Any) -> Any:
+        A, B = parts
+        x, u, v = logs
+        A, B = A * xp.exp2(x) / xp.exp2(x)[:, None], B * xp.exp2(u) / xp.exp2(x)[:, None]
+        costs = [root * xp.exp2(w - v) for root, w in zip(roots, (x, u), strict=True)]
+        given, moved = logs_of(A, B)
+        gives, acts = logs_of(A.T, costs[0][:, None])
+        # Half of the way, for others move too; where one of the two is nothing the other becomes 1.
+        x = x + (given - gives) / xp.where(moved & acts, 4, 2)
+        u = u - logs_of(B.T, costs[1][:, None])[0]
+        v = v + logs_of(xp.concatenate(costs)[None])[0][0]
+        return tuple(xp.clip(w, -_FARTHEST, _FARTHEST) for w in (x, u, v))
+
+    def settled(parts: Any, logs: Any) -> Any:
+        if xp is np:
+            for _ in range(_SWEEPS):
+                logs = sweep(parts, logs)
+            return logs
+        return jax.lax.fori_loop(0, _SWEEPS, lambda _, logs: sweep(parts, logs), logs)
+
+    logs = settled((others, B), (xp.zeros(n, dtype), xp.zeros(m, dtype), xp.zeros((), dtype)))
+    x, u, _ = (xp.exp2(w) for w in logs)
+    a, b = others * x / x[:, None], B * u / x[:, None]
+    rows = xp.maximum(xp.max(xp.concatenate([a, b], axis=1), axis=1, initial=0.0), itself)
+    acts = xp.maximum(a.max(axis=0), itself)
+    kept = others * (a > _ROUNDING * xp.minimum(rows[:, None], acts))
+    x, u, v = settled((kept, B * (b > _ROUNDING * rows[:, None])), logs)
+    whole = lambda w: xp.ldexp(xp.ones_like(w), xp.round(w).astype(int))
+    return Units(whole(x), whole(u), whole(2 * v))
 
 
 def less_identity(A: np.ndarray) -> np.ndarray:

@@ -107,6 +107,18 @@ def test_units_decide_nothing(kind):
     assert (0 < refused < 20) == (kind in ("unmoved", "unseen"))
 
 
+@pytest.mark.parametrize("weak", [1e-7, 1e-12, 1e-17])
+def test_weak_couplings_do_not_decide_units(weak):
+    """Twelve states, three of which each input moves; everything acts weakly on everything."""
+    rng = np.random.default_rng(0)
+    chain = np.eye(3) + 0.1 * np.eye(3, k=1) + np.diag([0.0, 0.02, 0.05])
+    A, B = np.kron(np.eye(4), chain), np.kron(np.eye(4), [[0.0], [0.0], [0.1]])
+    plain = lqr(LinearSystem(A, B), np.eye(12), np.eye(4))
+    A, B = A + weak * rng.normal(size=A.shape), B + weak * rng.normal(size=B.shape)
+    found = lqr(LinearSystem(A, B), np.eye(12), np.eye(4))
+    np.testing.assert_allclose(found.K, plain.K, rtol=0, atol=1e3 * weak + 1e-9)
+
+
 TURN = np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
 
 
