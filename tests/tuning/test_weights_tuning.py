@@ -287,7 +287,8 @@ def test_derivatives_of_100_random_problems(x64):
 def test_derivatives_through_a_robot(x64, linearize):
     """Every weight and the penalty of a pendulum in MJX, a joint stop in its way, forward and
     reverse, against differences: to 1e-3 (asked), here 1e-5."""
-    robot = jm.load_robot("pendulum", velocity=([-1.0], [1.0]), torque=([-60.0], [60.0]))
+    with pytest.warns(UserWarning, match="wider limits than its file"):
+        robot = jm.load_robot("pendulum", velocity=([-1.0], [1.0]), torque=([-60.0], [60.0]))
     x, u = robot.equilibrium()
     goal = {"reference": np.asarray(robot.coordinates(x)), "input_reference": np.asarray(u)}
     mpc = jm.robot_mpc(robot, [4.0, 0.04], [1e-4], horizon=8)
