@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxmpc.arrays import Reals, host_array
 from jaxmpc.batches import Compiled, Part, default_chunk, first_rows, padded, slices, work_off
-from jaxmpc.checks import fail, require_shape, whole
+from jaxmpc.checks import fail, require_kind, require_shape, whole
 from jaxmpc.closed_loop.robot_controller import RobotController, robot_mpc
 from jaxmpc.closed_loop.simulation import simulate_many
 from jaxmpc.feasible.map import FeasibleSetMap
@@ -127,6 +127,7 @@ class RobotSetting:
             fail("robot", f"is a {type(robot).__name__}", "Give a Robot or a LinearPlant")
         if claim not in CLAIMS:
             fail("claim", f"{claim!r}", f"Give one of {', '.join(CLAIMS)}")
+        require_kind("mpc", mpc, MPC, cure="Give a jm.MPC, such as of robot_mpc")
         mpc.validate()
         mpc.require_constant("the loops of a robot have the same problem at every time step")
         if (mpc.system.n, mpc.system.m) != (robot.n, robot.m):
@@ -137,7 +138,7 @@ class RobotSetting:
         number = isinstance(seconds, int | float) and not isinstance(seconds, bool)
         if not number or not 0 < seconds < math.inf:
             fail("seconds", f"{seconds!r}", "Give a positive number")
-        x, u = robot.equilibrium(target)
+        x, u = robot.equilibrium() if target is None else robot.set_point(target)
         with jax.enable_x64(True):
             reference = np.asarray(robot.coordinates(np.asarray(x)), np.float64)
         limited = with_initial_limits(mpc, robot.state_limits)

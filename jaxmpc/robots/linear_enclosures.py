@@ -101,7 +101,7 @@ def linear_enclosure(
     if not 0 < tolerance < 1:
         fail("tolerance", f"{tolerance}", "Give a fraction, as 0.02")
     whole("cells", cells, 1)
-    state, u = robot.equilibrium(target)
+    state, u = robot.equilibrium() if target is None else robot.set_point(target)
     x = host_coordinates(robot, state)
     z = np.concatenate([x, u])
     lower, upper = _bounds(robot, states, inputs, z)

@@ -217,6 +217,10 @@ def test_deviations_are_the_same_problem():
     ("change", "message"),
     [
         ({"robot": object()}, "robot: is a object"),
+        ({"mpc": "joint"}, "mpc: is a str. Give a jm.MPC"),
+        ({"target": [np.nan]}, "target: "),
+        ({"target": [1.0, 2.0]}, r"target: shape \(2,\)"),
+        ({"chunk": 1.5}, "chunk: 1.5"),
         ({"mpc": problems.joint()}, r"mpc: has \(2, 1\) states and inputs"),
         ({"mpc": problems.scalar(input_rate_limit=0.1)}, "input rates"),
         ({"x0s": np.zeros((4, 2))}, r"x0s: shape \(4, 2\)"),
