@@ -81,10 +81,10 @@ class ClosedLoopLoss:
             fail("band", "is None", "Give the size (n,) of what counts as settled")
         if self.band is not None:
             require_real("band", self.band)
-        if self.band is not None and not np.all(np.asarray(self.band) > 0):
-            fail("band", f"{self.band}", "Give positive numbers")
-        if self.band is not None and np.ndim(self.band) > 1:
-            fail("band", f"shape {np.shape(self.band)}", "Give (n,), one number for each state")
+            if not np.all(np.asarray(self.band) > 0):
+                fail("band", f"{self.band}", "Give positive numbers")
+            if np.ndim(self.band) > 1:
+                fail("band", f"shape {np.shape(self.band)}", "Give (n,), one number for each state")
         if not self.softness > 0:
             fail("softness", f"{self.softness}", "Give a positive number")
 
