@@ -239,7 +239,7 @@ def test_pushed_quadrupeds_stand():
     assert module.stood(run.states).all()
     assert np.abs(run.states[:, :, :2]).max() > 0.02  # they were pushed indeed
     normal, share, error = module.of_feet(robot, run)
-    assert error.max() < 3e-8
+    assert error.max() < 1e-12
     late = slice(60, None)
     np.testing.assert_allclose(normal[:, late].sum(axis=2), 9.81 * rest.mass, rtol=0.1)
     assert share[:, late][normal[:, late] > 1].max() < 0.9
