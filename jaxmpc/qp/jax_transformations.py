@@ -570,6 +570,9 @@ def implicit(
     conditions_of(data, constants, z, y) gives the optimality conditions as a function of the data
     alone, with z, y and the active set fixed, and the function that maps a change of them to
     the change of (z, y) that undoes it.
+
+    A solution that is not finite, as of a state that overflows, has the derivative zero: in the
+    sums over a batch it would make those of all others NaN.
     """
     return z, y
 
@@ -582,8 +585,11 @@ def _implicit_jvp(conditions_of: Conditions, primals: tuple, tangents: tuple) ->
     z, y = implicit(conditions_of, data, constants, z, y)
 
     def moved(data: Any, constants: Any, z: Array, y: Array, change: Any) -> tuple[Array, Array]:
+        sound = jnp.all(jnp.isfinite(jnp.concatenate([z.ravel(), y.ravel()])))
+        z, y = (jnp.where(sound, v, 0.0) for v in (z, y))
         conditions, undo = conditions_of(data, constants, z, y)
-        return undo(jax.jvp(conditions, (data,), (change,))[1])
+        dz, dy = undo(jax.jvp(conditions, (data,), (change,))[1])
+        return jnp.where(sound, dz, 0.0), jnp.where(sound, dy, 0.0)
 
     # Going backward, all but these arguments is computed then: kept, it would be several times as
     # much memory for each solve of a closed loop.

@@ -411,6 +411,41 @@ def test_float32_and_bad_elements():
 
 
 @pytest.mark.parametrize(
+    ("one", "x64"),
+    [
+        (solve_stagewise, True),
+        pytest.param(solve_stagewise, False, marks=pytest.mark.slow),
+        pytest.param(jm.solve, False, marks=pytest.mark.slow),
+        pytest.param(jm.solve, True, marks=pytest.mark.slow),
+    ],
+)
+def test_a_state_far_off_is_solved_within_limits_or_not(one, x64):
+    """Rounding of the steps that lead to a plan, 1e-16 of 1e15, is no excuse for inputs of a
+    thousand where the limit is 1; and no state makes the derivatives of others NaN."""
+    mpc = jm.MPC(
+        jm.LinearSystem([[1, 0.1], [0, 1]], [[0.005], [0.1]]), np.eye(2), np.eye(1), 6,
+        inputs=symmetric(1.0), states=None if one is solve_stagewise else symmetric(5.0, 5.0),
+    )  # fmt: skip
+    with enable_x64(x64):
+        dtype = jnp.result_type(float)
+        size = np.concatenate([[1.0, 2.0], 10.0 ** np.arange(6, 300 if x64 else 34, 7)])
+        x0 = jnp.asarray(size[:, None] * np.array([1.0, -0.3]), dtype)
+
+        def loss(B, x0):
+            system = replace(mpc.system, B=B)
+            plan = jax.vmap(lambda x: one(replace(mpc, system=system), x))(x0)
+            return jnp.sum(plan.inputs[:2] ** 2), plan
+
+        change = jax.jit(jax.value_and_grad(loss, has_aux=True))
+        B = jnp.asarray(mpc.system.B, dtype)
+        ((_, plan), of_all), (_, of_two) = change(B, x0), change(B, x0.at[2:].set(1.0))
+    solved = np.asarray(plan.status) == jm.Status.SOLVED
+    assert solved[:2].all()
+    assert np.abs(plan.inputs[solved]).max() <= 1 + 1e-5
+    np.testing.assert_allclose(of_all, of_two, rtol=1e-9 if x64 else 1e-5)
+
+
+@pytest.mark.parametrize(
     "change, words",
     [
         (lambda mpc, s: (replace(mpc, terminal_set=jm.Ellipsoid(np.eye(n), 1.0)), s), "jm.solve"),

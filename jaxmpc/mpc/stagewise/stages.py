@@ -350,7 +350,8 @@ def residuals_of(s: Stages, E: Array, u: Array, y: Array, found: Optimality) -> 
     u'g + g(rows) + g*(y) − y'rows: at the optimum both parts are zero. What is typical of a row
     and of an input is what is the most of the same one over the horizon. All that may vanish, as
     where u = 0 is all that limits allow: inputs that cost as much as the plan, J ≤ ½ c, move a row
-    of scale E by up to √c/E, and steps that end at a limit leave rounding of that.
+    of scale E by up to √c/E, and steps that end at a limit of zero leave rounding of that. Another
+    limit is what its row is compared with, however far off the plan without it is.
     """
     bounds = s.bounds
     reach = jnp.where(E > 0, jnp.sqrt(2 * found.cost_terms) / jnp.where(E > 0, E, 1.0), 0.0)
@@ -370,7 +371,7 @@ def residuals_of(s: Stages, E: Array, u: Array, y: Array, found: Optimality) -> 
         return jnp.concatenate([*(jnp.broadcast_to(m, p.shape).ravel() for p, m in pairs), v[:0]])
 
     row_size = jnp.maximum(bounds.sizes(), jnp.abs(found.rows))
-    row_terms = own_terms + row_size
+    row_terms = jnp.where(bounds.sizes() > 0, found.row_terms, own_terms) + row_size
     gradient_size = found.gradient_size + SHARE * jnp.max(found.gradient_size, axis=0)
     gradient_terms = found.gradient_terms + jnp.max(found.gradient_terms, axis=0)
     row_sizes = row_size + SHARE * most(row_size)
