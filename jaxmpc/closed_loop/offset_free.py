@@ -40,10 +40,11 @@ class OffsetFreeController:
     At each time step the target is the steady state of the model under the estimated d,
         x_s = A x_s + B u_s + c + B_d d,   within all limits of the problem (terminal set included),
     whose tracked outputs T (C x_s + C_d d) are the nearest to those of the reference, T C r; it is
-    r's outputs themselves where the limits let them be. Of several the one of least effort. The
-    plan tracks x_s, u_s and predicts with c + B_d d. A reference over time, or a forecast, has the
-    target of each of its rows. Where no steady state keeps the limits, the plan has the status of
-    the search for one (PRIMAL_INFEASIBLE mostly).
+    r's outputs themselves where the limits let them be. Of several the one of least effort, u'Ru
+    with the R of the problem (and x'Qx where no input tells them apart). The plan tracks x_s, u_s
+    and predicts with c + B_d d. A reference over time, or a forecast, has the target of each of its
+    rows. Where no steady state keeps the limits, the plan has the status of the search for one
+    (PRIMAL_INFEASIBLE mostly).
 
     Where the loop settles, no target at a limit that the plant cannot keep, the tracked outputs are
     at their references, if there are as many disturbances as measured outputs; whatever the true

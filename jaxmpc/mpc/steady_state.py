@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 from jax import Array
+from jax.scipy.linalg import solve_triangular
 
 from jaxmpc.arrays import Reals, host_array
 from jaxmpc.checks import fail, require_finite, require_shape
-from jaxmpc.mpc.problem import HARD, MPC
+from jaxmpc.mpc.problem import HARD, MPC, weights_of
 from jaxmpc.mpc.rows import Block, blocks, joined_bounds
 from jaxmpc.pytrees import named_pytree, pytree, static
 from jaxmpc.qp.admm import ADMM, Factor, factorise
@@ -28,9 +29,13 @@ from jaxmpc.systems.units import balanced, less_identity
 
 # Singular values of balanced matrices, relative to the largest, that count as zero.
 FLAT = 1e-10
-# Weight of effort beside distances of outputs, where these leave inputs free. Outputs are off by
-# its square (`SteadyStates.nearest`).
+# Weight of effort beside distances of outputs, where these leave inputs free, in units in which the
+# row that outputs move most beside effort sees both alike (`_price`). Outputs are off by its square
+# (`SteadyStates.nearest`). Rows of less than LEAST_SHARE of that do not count for it.
 EFFORT = 1e-6
+LEAST_SHARE = 1e-3
+# Weight of x'Qx beside u'Ru in effort: it decides where no input tells, as of positions at rest.
+STATES = 1e-8
 # Errors of targets are errors of the loop, which settles there.
 TIGHT = ADMM(eps=1e-10)
 
@@ -129,10 +134,13 @@ class SteadyStates:
     All solutions of [I − A, −B] (x, u) = c + load are (x, u) = held (c + load) + free w, w (m,): of
     the problem for a target of the outputs C x only w is left. With the singular values σ of the
     outputs of `free`, in units, w is turned and scaled so that the first `count` entries of
-    v = σ V'w move outputs; the others, if any, move none, and are as small as the limits let them.
+    v = σ V'w move outputs; the others, if any, move none. What they move has as its effort, u'Ru
+    + STATES·x'Qx, the sum of their squares, apart from that of the first ones, and they come as
+    close as the limits let them to those of least effort.
 
     held (n + m, n), free (n + m, m), outputs (q, n), rows: H (r, n + m), bounds. unit (q,).
-    seen (m, q): from errors of outputs to v. count: of the entries of v that outputs see.
+    seen (m, q): from errors of outputs to v. at_ease (m, n + m): from held (c + load) to the v of
+    least effort. count: of the entries of v that outputs see.
     """
 
     held: Any
@@ -141,6 +149,7 @@ class SteadyStates:
     outputs: Any
     unit: Any
     seen: Any
+    at_ease: Any
     H: Any
     bounds: Bounds
     factor: Factor
@@ -170,10 +179,11 @@ class SteadyStates:
         free = column[:, None] * right[n:].T
         U, sigma, V = np.linalg.svd(outputs / unit[:, None] @ free[:n])
         count = int(np.sum(sigma > 1e-8 * max(sigma.max(initial=0.0), np.finfo(float).tiny)))
-        free = free @ V.T * np.append(1 / sigma[:count], np.ones(m - count))
+        dtype = floating_dtype(mpc)
+        turned = free @ V.T * np.append(1 / sigma[:count], np.ones(m - count))
+        by_effort, at_ease = _by_effort(mpc, turned, count)
         seen = np.zeros((m, len(unit)))
         seen[:count] = U.T[:count]
-        dtype = floating_dtype(mpc)
         rows = [_at_rest(b) for b in blocks(mpc, dtype) if b.steps and not b.rate]
         bounds = joined_bounds([b.bounds() for b in rows], dtype)
         parts = [jnp.zeros((0, n + m), dtype)]
@@ -181,8 +191,10 @@ class SteadyStates:
             sides = ((b.H, n), (b.D, m))
             columns = [jnp.zeros((b.size, size), dtype) if M is None else M for M, size in sides]
             parts.append(jnp.concatenate(columns, axis=1))
-        given = arrays((held, free, c, outputs, unit, seen, jnp.concatenate(parts), bounds))
-        factor = _factor(given[1], given[6], TIGHT, count=count, balls=bounds.balls)
+        given = arrays(
+            (held, free, c, outputs, unit, seen, at_ease, jnp.concatenate(parts), bounds)
+        )
+        factor = _factor(given[1], given[7], TIGHT, count=count, balls=bounds.balls)
         return cls(*given, factor, arrays(TIGHT), count)
 
     def nearest(self, target: Array, load: Array) -> SteadyState:
@@ -203,17 +215,53 @@ def _at_rest(block: Block) -> Block:
     return replace(hard, steps=block.steps[:1])
 
 
+def _by_effort(mpc: MPC, free: np.ndarray, count: int) -> tuple[Array, Array]:
+    """Return the directions `free` (n + m, m), with those behind the first `count` turned and
+    scaled so that effort is a sum of squares along them, and to which the first ones are
+    perpendicular in effort; and `SteadyStates.at_ease`."""
+    dtype, n = floating_dtype(mpc), mpc.system.n
+    Q, R, *_ = weights_of(mpc, dtype)
+    Q, R = (jnp.mean(M, axis=0) if M.ndim == 3 else jnp.asarray(M) for M in (Q, R))
+    given = jnp.asarray(free, dtype)
+    moved, unseen = given[:, :count], given[:, count:]
+    weighed = jnp.concatenate([STATES * matmul(Q, unseen[:n]), matmul(R, unseen[n:])])
+    W = matmul(unseen.T, weighed)
+    size = jnp.sum(jnp.diag(W))
+    least = jnp.where(size > 0, 1e-12 * size, 1.0)  # of directions without a cost
+    L = jnp.linalg.cholesky(W + least * jnp.eye(len(W), dtype=dtype))
+    by_row = lambda M: solve_triangular(L, M.T, lower=True) if len(W) else M.T
+    unseen, effort = by_row(unseen).T, by_row(weighed)
+    moved = moved - matmul(unseen, matmul(effort, moved))
+    at_ease = -jnp.concatenate([jnp.zeros((count, len(free)), dtype), effort])
+    return jnp.concatenate([moved, unseen], axis=1), at_ease
+
+
 @compiled_lightly(0, static_argnames=("count", "balls"))
 @own_modes
 def _factor(free: Array, H: Array, solver: ADMM, *, count: int, balls: tuple[int, ...]) -> Factor:
-    price = _price(free, count)
+    price = _price(H, free, count)
     return factorise(2 * jnp.diag(price), matmul(H, free.astype(H.dtype)), solver, balls)
 
 
-def _price(free: Array, count: int) -> Array:
-    """Return the weights (m,) of the distances in v: 1 where outputs see them, else EFFORT."""
+def _price(H: Array, free: Array, count: int) -> Array:
+    """Return the weights (m,) of the distances in v: 1 where outputs see them, else ε.
+
+    Where a row of limits asks f of effort, outputs d away from their target and the row moved by
+    h_s along outputs and by h_f along effort, both of length one, the least of d² + ε f² has
+    d = ε (h_s/h_f) f: it is small where ε is beside the least of (h_f/h_s)². Units of rows, outputs
+    and effort play no part in that.
+    """
     m = free.shape[1]
-    return jnp.where(np.arange(m) < count, 1.0, EFFORT).astype(free.dtype)
+    moved, size = matmul(H, free), matmul(jnp.abs(H), jnp.abs(free))
+    moved = jnp.where(jnp.abs(moved) > FLAT * size, moved, 0.0)
+    along, across = (jnp.linalg.norm(part, axis=1) for part in (moved[:, :count], moved[:, count:]))
+    both = (along > 0) & (across > 0)
+    share = jnp.where(both, across / jnp.where(both, along, 1.0), jnp.nan)
+    most = jnp.nanmax(share, initial=0.0)
+    least = jnp.where(both & (share > LEAST_SHARE * most), share, jnp.inf)
+    least = jnp.min(least, initial=jnp.inf)
+    price = EFFORT * jnp.where(jnp.isfinite(least), least, 1.0) ** 2
+    return jnp.where(np.arange(m) < count, 1.0, price).astype(free.dtype)
 
 
 @compiled_lightly(1)
@@ -223,8 +271,8 @@ def _nearest(p: SteadyStates, target: Array, load: Array) -> SteadyState:
     p = jax.tree.map(lambda v: v.astype(dtype) if v.dtype.kind == "f" else v, p)
     n, m = p.outputs.shape[1], p.free.shape[1]
     base = matmul(p.held, p.c + load)
-    aim = matmul(p.seen, (target - matmul(p.outputs, base[:n])) / p.unit)
-    price = _price(p.free, p.count)
+    aim = matmul(p.seen, (target - matmul(p.outputs, base[:n])) / p.unit) + matmul(p.at_ease, base)
+    price = _price(p.H, p.free, p.count)
     H, shift, limits = matmul(p.H, p.free), matmul(p.H, base), p.bounds
     lower, upper = limits.l - shift, limits.u - shift
     rest = limits.radius, limits.sizes(), limits.balls

@@ -4,10 +4,12 @@ are solved by enumeration, closed forms and differences."""
 import itertools
 from dataclasses import replace
 
+import daqp
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy
 
 import jaxmpc as jm
 from jaxmpc.closed_loop import (
@@ -163,6 +165,48 @@ def test_redundant_inputs():
         np.testing.assert_allclose(found.x, A @ found.x + B @ found.u, atol=1e-12)
         assert np.abs(found.u).max() <= 1 + 1e-9
     assert np.abs(found.u).max() > 1 - 1e-5
+
+
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
+def test_targets_of_redundant_inputs_in_any_units(seed):
+    """Three inputs, one tracked output: it is as near as linear programs bring it, with the least
+    effort u'Ru that DAQP finds there, whatever the units of states, inputs and distances."""
+    rng = np.random.default_rng(seed)
+    A, B, C = (
+        np.diag([0.9, 0.6]) + 0.1 * rng.normal(size=(2, 2)),
+        rng.normal(size=(2, 3)),
+        rng.normal(size=2),
+    )
+    R, most = rng.uniform(0.1, 1, 3), np.append(rng.uniform(0.3, 1, 3), rng.uniform(0.5, 3, 2))
+    gain = np.linalg.solve(np.eye(2) - A, B)
+    rows = np.vstack([np.eye(3), gain])  # of u and of x at rest
+    values = [scipy.optimize.linprog(sign * C @ gain, np.vstack([rows, -rows]), np.tile(most, 2),
+                                     bounds=(None, None)).fun for sign in (1, -1)]  # fmt: skip
+    for goal in (0.5 * values[0], -0.9 * values[1], -1.5 * values[1]):
+        best = np.clip(goal, values[0], -values[1])
+        lower, upper = np.append(-most, best - 1e-10), np.append(most, best + 1e-10)
+        u = daqp.solve(np.diag(2 * R), np.zeros(3), np.vstack([rows, C @ gain]), upper, lower,
+                       np.zeros(6, np.int32))[0]  # fmt: skip
+        for size in (0, 3, 20):
+            sx, su = (
+                2.0 ** rng.integers(-size, size + 1, 2),
+                2.0 ** rng.integers(-size, size + 1, 3),
+            )
+            system = jm.LinearSystem(sx[:, None] * A / sx, sx[:, None] * B / su)
+            mpc = jm.MPC(
+                system, 1 / sx**2, R / su**2, 4, states=jm.Box(-sx * most[3:], sx * most[3:]),
+                inputs=jm.Box(-su * most[:3], su * most[:3]), constrain_initial=False,
+            )  # fmt: skip
+            seen = KalmanFilter(
+                system, 0.1 * sx, 0.1, C=[C / sx], disturbance=Disturbance("output", 0.1)
+            )
+            free = OffsetFreeController(
+                jm.Controller(mpc), seen, units=[10.0 ** rng.integers(-4, 5)]
+            )
+            found = free.target(sx * C * goal / (C @ C))
+            assert found.status == jm.Status.SOLVED
+            assert abs(C @ (found.x / sx) - best) < 1e-8
+            np.testing.assert_allclose(found.u / su, u, atol=1e-5)
 
 
 @pytest.mark.slow

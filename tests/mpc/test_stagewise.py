@@ -445,6 +445,22 @@ def test_a_state_far_off_is_solved_within_limits_or_not(one, x64):
     np.testing.assert_allclose(of_all, of_two, rtol=1e-9 if x64 else 1e-5)
 
 
+@pytest.mark.parametrize("cost", [0.1, 1e-6])
+def test_held_inputs_do_not_move(cost):
+    """Where limits hold all inputs of an unstable plant no state moves them, however little they
+    cost: a share of 3e-4 of the gain was left."""
+    A = np.array([[1, 0.015, 0, 0], [0, 1, 0, 0], [0, 0, 1.01, 0.015], [0, 0, 1.6, 1.01]])
+    system = jm.LinearSystem(A, [[0.0004], [0.05], [-0.004], [-0.55]])
+    mpc = jm.MPC(
+        system, [100.0, 1, 100, 1], cost, 11, inputs=jm.Box(-4, 4), terminal_cost=1e3 * np.ones(4)
+    )
+    inputs = lambda x: solve_stagewise(mpc, x).inputs
+    x0 = jnp.array([0, 0, -2.5, 0.0])
+    np.testing.assert_allclose(inputs(x0), -4.0, atol=1e-6)
+    gain = np.abs(jm.lqr(system, mpc.Q, mpc.R).K).max()
+    assert np.abs(jax.jacobian(inputs)(x0)).max() < 1e-8 * gain
+
+
 @pytest.mark.parametrize(
     "change, words",
     [

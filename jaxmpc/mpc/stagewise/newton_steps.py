@@ -67,6 +67,8 @@ LEAST_SLACK, FRACTION, REST = 1e-2, 0.995, 1e-8
 MOST_CURVED = 10.0
 # Where rounding stops the method: its own residuals, once below BEGUN, grow LOST times.
 BEGUN, LOST = 1e-3, 100.0
+# κ of derivatives: of the rounding of their steps, a share 1e-16 κ, the second leaves nothing.
+KAPPA = 1e9
 # Of a proximal term on the multipliers: weights of 1e11 and more would be lost in rounding.
 DAMPING = 1e-11
 
@@ -100,11 +102,12 @@ def distance(s: Stages, E: Array, rho: Array, u: Array, y: Array) -> Array:
 
 
 def newton_direction(
-    s: Stages, E: Array, rho: Array, v: Array
+    s: Stages, E: Array, rho: Array, v: Array, kappa: float | None = None
 ) -> Callable[[Array, Array], tuple[Array, Array]]:
-    """Return the linear map (c, gradient) → (du, dy) of a Newton step at v + y/ρ (rows,)."""
+    """Return the linear map (c, gradient) → (du, dy) of a Newton step at v + y/ρ (rows,). kappa: κ,
+    None for that of Newton's method."""
     D = s.bounds.scaled(E).curvature(v, rho)[0]
-    loose = 1 - D + D * rho / Constants.of(E.dtype).linear
+    loose = 1 - D + D * rho / (Constants.of(E.dtype).linear if kappa is None else kappa)
     omega = rho * D / loose
     gains = riccati(s, omega * E**2)
 
@@ -344,7 +347,7 @@ def stage_conditions(
         return flat(found.gradient, D * (E * found.rows + push) - push)
 
     def inverse(s: Stages, E: Array, rho: Array, v: Array, b: Array) -> Array:
-        step = newton_direction(s, E, rho, v)
+        step = newton_direction(s, E, rho, v, KAPPA)
         zero = jnp.zeros_like(y, E.dtype), jnp.zeros_like(u, E.dtype)
 
         def follow(b: Array) -> Array:
@@ -352,7 +355,8 @@ def stage_conditions(
             # The step is linear; as a derivative of itself it can be transposed, kernels or not.
             return flat(*jax.jvp(step, zero, (c, gradient))[1])
 
-        # What the proximal step on y leaves, of relative size ρ/κ, is taken up by a second step.
+        # The proximal step on y leaves a share 1/(1 + κ s²) where the active rows have the least
+        # singular value s, which is small where inputs cost little; a second step the square of it.
         first = follow(b)
         return first + follow(b - J(s, E, rho, v, first))
 
