@@ -181,7 +181,7 @@ class SteadyStates:
         count = int(np.sum(sigma > 1e-8 * max(sigma.max(initial=0.0), np.finfo(float).tiny)))
         dtype = floating_dtype(mpc)
         turned = free @ V.T * np.append(1 / sigma[:count], np.ones(m - count))
-        by_effort, at_ease = _by_effort(mpc, turned, count)
+        ordered, at_ease = _by_effort(mpc, turned, count)
         seen = np.zeros((m, len(unit)))
         seen[:count] = U.T[:count]
         rows = [_at_rest(b) for b in blocks(mpc, dtype) if b.steps and not b.rate]
@@ -191,9 +191,8 @@ class SteadyStates:
             sides = ((b.H, n), (b.D, m))
             columns = [jnp.zeros((b.size, size), dtype) if M is None else M for M, size in sides]
             parts.append(jnp.concatenate(columns, axis=1))
-        given = arrays(
-            (held, free, c, outputs, unit, seen, at_ease, jnp.concatenate(parts), bounds)
-        )
+        H = jnp.concatenate(parts)
+        given = arrays((held, ordered, c, outputs, unit, seen, at_ease, H, bounds))
         factor = _factor(given[1], given[7], TIGHT, count=count, balls=bounds.balls)
         return cls(*given, factor, arrays(TIGHT), count)
 
