@@ -67,8 +67,9 @@ LEAST_SLACK, FRACTION, REST = 1e-2, 0.995, 1e-8
 MOST_CURVED = 10.0
 # Where rounding stops the method: its own residuals, once below BEGUN, grow LOST times.
 BEGUN, LOST = 1e-3, 100.0
-# κ of derivatives: of the rounding of their steps, a share 1e-16 κ, the second leaves nothing.
-KAPPA = 1e9
+# κ of derivatives, two steps of which leave a share of 1e-8 where Newton's would leave 1e-4; with
+# 1e9 rounding was seen, 2e-8.
+KAPPA = 1e8
 # Of a proximal term on the multipliers: weights of 1e11 and more would be lost in rounding.
 DAMPING = 1e-11
 
