@@ -222,13 +222,13 @@ def tuned(loop: Loop, value: Callable, rule: str, s: Settings) -> tuple[np.ndarr
     return best[1], losses, float(np.median(seconds))
 
 
-def differences(value: Callable, theta: np.ndarray) -> float:
-    """Return the largest difference of the gradient from central differences, relative to its
-    largest entry."""
+def differences(value: Callable, theta: np.ndarray, size: float = 1e-6) -> float:
+    """Return the largest difference of the gradient from central differences over steps of this
+    size (in units of the numbers, 0.01 at least), relative to its largest entry."""
     gradient, found = np.asarray(value(jnp.asarray(theta))[1]), []
     for i, number in enumerate(theta):
         step = np.zeros_like(theta)
-        step[i] = 1e-6 * max(abs(number), 1e-2)
+        step[i] = size * max(abs(number), 1e-2)
         ahead, behind = (float(value(jnp.asarray(theta + v))[0]) for v in (step, -step))
         found.append((ahead - behind) / (2 * step[i]))
     return float(np.abs(gradient - found).max() / np.abs(gradient).max())

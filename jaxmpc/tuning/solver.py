@@ -43,7 +43,7 @@ from jaxmpc.tuning.descent import Settings, descend
 from jaxmpc.tuning.result import TuningRun, cached
 
 # Version of the algorithm: results that an older version cached are not used.
-VERSION = 3
+VERSION = 4
 # Constant penalties that are tried as a start, with this over-relaxation.
 CONSTANTS, ALPHA = np.logspace(-2, 2, 9), 1.6
 # Fewest states to learn from, validation included, and for validation.
@@ -95,9 +95,10 @@ def tune_solver(
     Returns a `TuningRun` whose result, also `run.solver`, is `solver` with rho (stages, rows),
     alpha and iterations, for solve, Controller, solve_many and (for a robot's mpc, at set-points)
     RobotController. It is the best of all steps on the validation set by the fraction solved, then
-    by the median residual; where none is better than `solver`, that is the result and a
-    UserWarning says so. Numbers in before, after and the history: solved, residual, and
-    infeasible, the states left out. `transfer_penalties` takes the result to another horizon.
+    by the median residual relative to its tolerance; where none is better than `solver`, that is
+    the result and a UserWarning says so. Numbers in before, after and the history: solved (by the
+    status of the quadratic programs), residual (this median), and infeasible, the states left out.
+    `transfer_penalties` takes the result to another horizon.
     Raises ValueError for bad input, before any compile, and for states all proved infeasible;
     on Ctrl-C `Interrupted`, as `tune_weights`.
     """
@@ -327,8 +328,12 @@ class PenaltyObjective:
         return self.condensed.qp(x, self.reference, self.input_reference)
 
     def digits(self, theta: Any, samples: Samples) -> Array:
-        """Return e (B,): log10 of the norm of all residuals over their tolerances."""
+        """Return `digits_of` the rho and alpha of θ."""
         rho, alpha = jnp.exp(theta["log_rho"] @ self.W.T), 2 * jax.nn.sigmoid(theta["alpha"])
+        return self.digits_of(rho, alpha, samples)
+
+    def digits_of(self, rho: Array, alpha: Array, samples: Samples) -> Array:
+        """Return e (B,): log10 of the norm of all residuals over their tolerances."""
         solver, c = replace(self.solver, rho=rho, alpha=alpha), self.condensed
         made = c.factor(solver)
         eps = solver.eps
@@ -375,7 +380,7 @@ def solve_samples(
     chunk: int,
     devices: Devices = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return status and largest residual (B,) of the samples by the solver itself.
+    """Return the status and the residual over its tolerance (B,) of the samples by the solver.
 
     rho (stages, rows). chunk: samples at once; one size, so that it compiles once.
     """
@@ -398,24 +403,23 @@ def _solve_batches(devices: Devices) -> Compiled:
 def _solve_batch(
     rho: Array, alpha: Array, objective: PenaltyObjective, samples: Samples
 ) -> tuple[Array, Array]:
-    """Return status and largest residual (B,) of a batch, in JAX."""
+    """Return status and residual over its tolerance (B,) of a batch, in JAX."""
     c, solver = objective.condensed, replace(objective.solver, rho=rho, alpha=alpha)
     made = c.factor(solver)
 
-    def one(sample: Samples) -> tuple[Array, Array]:
-        s = with_fault(*solve_factored(objective.qp(sample.x), made, solver, sample.start))
-        worst = jnp.maximum(jnp.maximum(s.primal_residual, s.dual_residual), jnp.abs(s.gap))
-        return s.status, worst
+    def one(sample: Samples) -> Array:
+        found = solve_factored(objective.qp(sample.x), made, solver, sample.start)
+        return with_fault(*found).status
 
-    return jax.vmap(one)(samples)
+    return jax.vmap(one)(samples), 10.0 ** objective.digits_of(rho, alpha, samples)
 
 
 def score(status: np.ndarray, worst: np.ndarray) -> dict[str, float]:
     """Return how well samples were solved, as `tune_solver` documents it.
 
     loss: the states that are not solved, plus a fraction of one that grows with the median
-    residual from 1e-16 to 1e16: less is better. solved: fraction SOLVED. residual: median of the
-    largest residuals; NaN counts as infinite.
+    residual from 1e-16 to 1e16: less is better. solved: fraction SOLVED. residual: median of those
+    over their tolerances, `worst`, in which units play no part; NaN counts as infinite.
     """
     median = float(np.median(np.nan_to_num(worst, nan=np.inf)))
     digits = float(np.log10(np.clip(median, 1e-16, 1e16)))

@@ -161,7 +161,8 @@ def test_published_closed_loops(name):
         theta, losses, _ = closed_loops.tuned(
             loop, value, "theirs", closed_loops.Settings(updates=4)
         )
-        # Of the pendulum: where the loop is not as sensitive as with the first weights.
-        assert closed_loops.differences(value, theta) < 1e-5
+        # Of the pendulum: where the loop is not as sensitive as with the first weights, and over
+        # steps beside which the rounding of its plans is small.
+        assert closed_loops.differences(value, theta, 1e-4) < 2e-4
         assert jax.jit(loop.run)(theta)[2].all()
     assert min(losses) < 0.5 * losses[0]
