@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 from jax import Array
-from jax.scipy.linalg import solve_triangular
 
 from jaxmpc.arrays import Reals, host_array
 from jaxmpc.checks import fail, require_finite, require_shape
@@ -18,7 +17,7 @@ from jaxmpc.mpc.rows import Block, blocks, joined_bounds
 from jaxmpc.pytrees import named_pytree, pytree, static
 from jaxmpc.qp.admm import ADMM, Factor, factorise
 from jaxmpc.qp.jax_transformations import compiled_lightly, own_modes
-from jaxmpc.qp.linalg import arrays, floating_dtype, matmul
+from jaxmpc.qp.linalg import arrays, floating_dtype, inverse_root, matmul
 from jaxmpc.qp.problem import QP, Bounds
 from jaxmpc.qp.residuals import with_fault
 from jaxmpc.qp.solve import solve_factored
@@ -140,7 +139,8 @@ class SteadyStates:
 
     held (n + m, n), free (n + m, m), outputs (q, n), rows: H (r, n + m), bounds. unit (q,).
     seen (m, q): from errors of outputs to v. at_ease (m, n + m): from held (c + load) to the v of
-    least effort. count: of the entries of v that outputs see.
+    least effort. price (m,): weights of distances in v (`_price`). count: of the entries of v that
+    outputs see.
     """
 
     held: Any
@@ -152,6 +152,7 @@ class SteadyStates:
     at_ease: Any
     H: Any
     bounds: Bounds
+    price: Any
     factor: Factor
     solver: ADMM
     count: int = static()
@@ -193,8 +194,8 @@ class SteadyStates:
             parts.append(jnp.concatenate(columns, axis=1))
         H = jnp.concatenate(parts)
         given = arrays((held, ordered, c, outputs, unit, seen, at_ease, H, bounds))
-        factor = _factor(given[1], given[7], TIGHT, count=count, balls=bounds.balls)
-        return cls(*given, factor, arrays(TIGHT), count)
+        priced = _factor(given[1], given[7], TIGHT, count=count, balls=bounds.balls)
+        return cls(*given, *priced, arrays(TIGHT), count)
 
     def nearest(self, target: Array, load: Array) -> SteadyState:
         """Return the steady state under a load (n,) whose outputs are nearest to the target (q,).
@@ -227,9 +228,8 @@ def _by_effort(mpc: MPC, free: np.ndarray, count: int) -> tuple[Array, Array]:
     W = matmul(unseen.T, weighed)
     size = jnp.sum(jnp.diag(W))
     least = jnp.where(size > 0, 1e-12 * size, 1.0)  # of directions without a cost
-    L = jnp.linalg.cholesky(W + least * jnp.eye(len(W), dtype=dtype))
-    by_row = lambda M: solve_triangular(L, M.T, lower=True) if len(W) else M.T
-    unseen, effort = by_row(unseen).T, by_row(weighed)
+    root = inverse_root(W + least * jnp.eye(len(W), dtype=dtype)) if len(W) else W
+    unseen, effort = matmul(unseen, root.T), matmul(root, weighed.T)
     moved = moved - matmul(unseen, matmul(effort, moved))
     at_ease = -jnp.concatenate([jnp.zeros((count, len(free)), dtype), effort])
     return jnp.concatenate([moved, unseen], axis=1), at_ease
@@ -237,9 +237,11 @@ def _by_effort(mpc: MPC, free: np.ndarray, count: int) -> tuple[Array, Array]:
 
 @compiled_lightly(0, static_argnames=("count", "balls"))
 @own_modes
-def _factor(free: Array, H: Array, solver: ADMM, *, count: int, balls: tuple[int, ...]) -> Factor:
+def _factor(
+    free: Array, H: Array, solver: ADMM, *, count: int, balls: tuple[int, ...]
+) -> tuple[Array, Factor]:
     price = _price(H, free, count)
-    return factorise(2 * jnp.diag(price), matmul(H, free.astype(H.dtype)), solver, balls)
+    return price, factorise(2 * jnp.diag(price), matmul(H, free.astype(H.dtype)), solver, balls)
 
 
 def _price(H: Array, free: Array, count: int) -> Array:
@@ -271,14 +273,13 @@ def _nearest(p: SteadyStates, target: Array, load: Array) -> SteadyState:
     n, m = p.outputs.shape[1], p.free.shape[1]
     base = matmul(p.held, p.c + load)
     aim = matmul(p.seen, (target - matmul(p.outputs, base[:n])) / p.unit) + matmul(p.at_ease, base)
-    price = _price(p.H, p.free, p.count)
     H, shift, limits = matmul(p.H, p.free), matmul(p.H, base), p.bounds
     lower, upper = limits.l - shift, limits.u - shift
     rest = limits.radius, limits.sizes(), limits.balls
     v = aim
     for _ in range(1 if p.count == m else 2):
         v = jnp.where(np.arange(m) < p.count, aim, v)
-        qp = QP(2 * jnp.diag(price), -2 * price * v, H, lower, upper, None, None, *rest)
+        qp = QP(2 * jnp.diag(p.price), -2 * p.price * v, H, lower, upper, None, None, *rest)
         found = with_fault(*solve_factored(qp, p.factor, p.solver))
         v = found.z
     z = base + matmul(p.free, v)

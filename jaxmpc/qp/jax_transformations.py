@@ -38,6 +38,7 @@ from jax.sharding import (
     get_abstract_mesh,
 )
 
+from jaxmpc.arrays import all_finite
 from jaxmpc.checks import concrete
 
 T = TypeVar("T")
@@ -585,7 +586,7 @@ def _implicit_jvp(conditions_of: Conditions, primals: tuple, tangents: tuple) ->
     z, y = implicit(conditions_of, data, constants, z, y)
 
     def moved(data: Any, constants: Any, z: Array, y: Array, change: Any) -> tuple[Array, Array]:
-        sound = jnp.all(jnp.isfinite(jnp.concatenate([z.ravel(), y.ravel()])))
+        sound = all_finite((z, y))
         z, y = (jnp.where(sound, v, 0.0) for v in (z, y))
         conditions, undo = conditions_of(data, constants, z, y)
         dz, dy = undo(jax.jvp(conditions, (data,), (change,))[1])

@@ -370,8 +370,9 @@ def residuals_of(s: Stages, E: Array, u: Array, y: Array, found: Optimality) -> 
         pairs = zip(parts, largest, strict=True)
         return jnp.concatenate([*(jnp.broadcast_to(m, p.shape).ravel() for p, m in pairs), v[:0]])
 
-    row_size = jnp.maximum(bounds.sizes(), jnp.abs(found.rows))
-    row_terms = jnp.where(bounds.sizes() > 0, found.row_terms, own_terms) + row_size
+    known = bounds.sizes()
+    row_size = jnp.maximum(known, jnp.abs(found.rows))
+    row_terms = jnp.where(known > 0, found.row_terms, own_terms) + row_size
     gradient_size = found.gradient_size + SHARE * jnp.max(found.gradient_size, axis=0)
     gradient_terms = found.gradient_terms + jnp.max(found.gradient_terms, axis=0)
     row_sizes = row_size + SHARE * most(row_size)
