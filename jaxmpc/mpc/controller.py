@@ -22,6 +22,7 @@ these terms are tracking errors too. The inputs that hold a robot at its set-poi
 plan that is right beside them need not be right beside the errors.
 """
 
+import copy
 import warnings
 from collections.abc import Callable
 from dataclasses import field, replace
@@ -299,6 +300,13 @@ def _factor(condensed: Condensed, solver: ADMM) -> Factor:
     return replace(made, row_norms=condensed.reach(made.row_norms))
 
 
+def with_solver(controller: Controller, solver: ADMM) -> Controller:
+    """Return the controller with another solver, whose numbers may be traced."""
+    other = copy.copy(controller)
+    vars(other).update(solver=solver, factor=_factor(controller.condensed, solver))
+    return other
+
+
 @compiled_lightly(1, static_argnames="whole")
 @own_modes
 def _control(
@@ -509,14 +517,17 @@ def stated_terms(controller: Controller, y: Array, x: Array, u: Array, aim: Aim)
 
     moved = jnp.concatenate([M.reshape(-1, M.shape[-1]) for M in (c.Gamma, c.Omega)])
     g = matmul(jnp.concatenate([gx.ravel(), gu.ravel()]), moved)
-    length, rounds = (jnp.sqrt(2 * jnp.maximum(v, 0.0)) for v in (J, cancels))
-    rounds = rounds + jnp.max(jnp.abs(y) * factor.row_norms, initial=0.0)
+    root = lambda v: jnp.where(v > 0, jnp.sqrt(jnp.where(v > 0, v, 1.0)), 0.0)
+    length, rounds = root(2 * J), root(2 * cancels)
+    # Not differentiated: NaN, where a compiler rounds what it compares in two ways.
+    largest = lambda v: jax.lax.stop_gradient(jnp.max(v, axis=0, initial=0.0))
+    rounds = rounds + largest(jnp.abs(y) * factor.row_norms)
 
     A, B, drift = dynamics_of(mpc.system, x.dtype)
     drift = drift if aim.forecast is None else drift + aim.forecast
     defects = x[1:] - (apply(A, x[:-1]) + apply(B, u) + drift)
     terms = dynamics_terms(A, B, drift, x, u)
-    most = jnp.max(jnp.abs(x), axis=0) + SHARE * jnp.max(terms, axis=0)
+    most = largest(jnp.abs(x)) + SHARE * largest(terms)
     most = jnp.broadcast_to(most, terms.shape)
     value, limit, slope = (jnp.concatenate([*v, y[:0]]) for v in (values, limits, slopes))
     row_size = jnp.maximum(limit, value)

@@ -5,10 +5,10 @@ is minimised is a smooth count of the sampled states that it leaves unsolved,
 
     mean over states of softplus(2 (e + margin)) / 2,    e = log10 |residuals / tolerances|,
 
-with the residuals by which the status is decided. A solved state counts almost nothing, another one
-the number of digits that are missing. (Learning to optimise by unrolling: Gregor,
-LeCun 2010; penalties of ADMM for QPs: Ichnowski et al. 2021, by reinforcement; Stellato et al.
-2020, §5.2, adapt one number while iterating.) For every rho the fixed points of the
+with the residuals of the plan as stated, by which its status is decided. A solved state counts
+almost nothing, another one the number of digits that are missing. (Learning to optimise by
+unrolling: Gregor, LeCun 2010; penalties of ADMM for QPs: Ichnowski et al. 2021, by reinforcement;
+Stellato et al. 2020, §5.2, adapt one number while iterating.) For every rho the fixed points of the
 iteration are the solutions: a bad rho costs steps but cannot make a solution wrong.
 """
 
@@ -29,21 +29,21 @@ from jaxmpc.arrays import Reals
 from jaxmpc.batches import Compiled, Devices, chosen_devices, divisible, each_part, over_devices
 from jaxmpc.checks import fail, require_finite, require_kind, whole
 from jaxmpc.files import fingerprint
-from jaxmpc.mpc.condense import Condensed, condensed_in_float64
-from jaxmpc.mpc.plan import Plan, WarmStart, checked_array
+from jaxmpc.mpc.condense import condensed_in_float64, in_float64
+from jaxmpc.mpc.controller import Controller, plan_with, stated_terms, with_solver
+from jaxmpc.mpc.plan import Aim, Plan, WarmStart, checked_array
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import pytree
-from jaxmpc.qp.admm import ADMM, ScaledProgram, iterate, read, splittings
-from jaxmpc.qp.problem import QP
-from jaxmpc.qp.residuals import residual_terms, with_fault
-from jaxmpc.qp.solve import solve_factored, warm
+from jaxmpc.qp.admm import ADMM
+from jaxmpc.qp.linalg import rounding
+from jaxmpc.qp.solve import solve_factored
 from jaxmpc.qp.status import Status
 from jaxmpc.tuning.batch_mean import BatchMean
 from jaxmpc.tuning.descent import Settings, descend
 from jaxmpc.tuning.result import TuningRun, cached
 
 # Version of the algorithm: results that an older version cached are not used.
-VERSION = 4
+VERSION = 5
 # Constant penalties that are tried as a start, with this over-relaxation.
 CONSTANTS, ALPHA = np.logspace(-2, 2, 9), 1.6
 # Fewest states to learn from, validation included, and for validation.
@@ -96,8 +96,8 @@ def tune_solver(
     alpha and iterations, for solve, Controller, solve_many and (for a robot's mpc, at set-points)
     RobotController. It is the best of all steps on the validation set by the fraction solved, then
     by the median residual relative to its tolerance; where none is better than `solver`, that is
-    the result and a UserWarning says so. Numbers in before, after and the history: solved (by the
-    status of the quadratic programs), residual (this median), and infeasible, the states left out.
+    the result and a UserWarning says so. Numbers in before, after and the history: solved (plans
+    whose status is SOLVED), residual (this median), and infeasible, the states left out.
     `transfer_penalties` takes the result to another horizon.
     Raises ValueError for bad input, before any compile, and for states all proved infeasible;
     on Ctrl-C `Interrupted`, as `tune_weights`.
@@ -107,12 +107,12 @@ def tune_solver(
     solver = SOLVER if solver is None else solver
     references = reference, input_reference
     objective = _objective(mpc, iterations, stages, groups, solver, references)
-    train, test = _samples(mpc, objective.condensed, x0s, warm_start, chosen)
-    given, c = replace(solver, iterations=iterations), objective.condensed
+    train, test = _samples(objective.controller, x0s, warm_start, chosen)
+    given, c = replace(solver, iterations=iterations), objective.controller.condensed
     if solver.rho is None:
         with jax.enable_x64(True):
-            first = jax.jit(lambda c, solver: c.factor(solver).rho[0, 0])
-            given = replace(given, rho=float(first(c, solver)))
+            first = with_solver(objective.controller, solver).factor.rho[0, 0]
+            given = replace(given, rho=float(first))
     decides: dict[str, Any] = {
         "version": VERSION,
         "iterations": int(iterations),
@@ -127,7 +127,9 @@ def tune_solver(
     }
     if chosen.optimizer is None:  # its schedule knows their number; with another, a run may grow
         decides["updates"] = chosen.updates
-    decides["fingerprint"] = fingerprint(decides, objective, train, test, given.rho, given.alpha)
+    tracked, penalties = (objective.reference, objective.input_reference), (solver.rho, given.alpha)
+    data = in_float64(mpc), tracked, objective.controller.solver, train, test, penalties
+    decides["fingerprint"] = fingerprint(decides, data)
 
     def tune() -> TuningRun:
         with jax.enable_x64(True):
@@ -259,31 +261,44 @@ def _objective(
         tracked.append(value)
     W = interpolation(groups, c.layout, N, c.balls, _knots(mpc))
     plain = replace(solver, iterations=int(iterations), rho=1.0, alpha=ALPHA, newton_steps=0)
-    unrolled = replace(plain, differentiate="unrolled")
-    return PenaltyObjective(c, W, tracked[0], tracked[1], unrolled)
+    with jax.enable_x64(True):
+        controller = Controller(in_float64(mpc), replace(plain, differentiate="unrolled"))
+    return PenaltyObjective(controller, W, tracked[0], tracked[1])
 
 
 def _samples(
-    mpc: MPC, c: Condensed, x0s: Reals, warm_start: Any, settings: Settings
+    controller: Controller, x0s: Reals, warm_start: Any, settings: Settings
 ) -> "tuple[Samples, Samples]":
     """Return the samples for training and for validation; ValueError for bad input."""
+    mpc = controller.mpc
     x = _states(mpc, "x0s", x0s)
     if len(x) < FEWEST:
         fail("x0s", f"{len(x)} states", f"Give at least {FEWEST}, better some hundred")
     if warm_start is not None:
-        if isinstance(warm_start, Plan | WarmStart):
-            each = jax.vmap(lambda plan: WarmStart.of(plan, c.layout, mpc))(warm_start)
-            warm_start = jax.vmap(c.variables)(each.states, each.inputs), each.multipliers
-        warm_start = tuple(np.asarray(part, np.float64) for part in warm_start)
-        for part, size in zip(warm_start, (len(c.P), len(c.C)), strict=True):
-            if part.shape != (len(x), size):
-                fail("warm_start", f"shape {part.shape}", f"Needed: {(len(x), size)}")
+        with jax.enable_x64(True):
+            warm_start = _warm_starts(controller, x, warm_start)
     samples = Samples(x, warm_start)
     if settings.splits:
         return settings.split(samples, FEWEST_VALIDATION, shuffle=True)
     if warm_start is not None:
         fail("validation", "given as states beside warm starts", "Give a fraction in (0, 1)")
     return samples, Samples(_states(mpc, "validation", settings.validation))
+
+
+def _warm_starts(controller: Controller, x: np.ndarray, given: Any) -> WarmStart:
+    """Return warm starts at the states x (B, p) as arrays with B in front."""
+    c, mpc = controller.condensed, controller.mpc
+    if isinstance(given, Plan | WarmStart):
+        each = jax.vmap(lambda plan: WarmStart.of(plan, c.layout, mpc))(given)
+    else:
+        z, y = (jnp.asarray(part, float) for part in given)
+        for part, size in ((z, len(c.P)), (y, len(c.C))):
+            if part.shape != (len(x), size):
+                fail("warm_start", f"shape {part.shape}", f"Needed: {(len(x), size)}")
+        each = WarmStart(*jax.vmap(c.trajectory)(jnp.asarray(x), z), y)
+    if len(each.inputs) != len(x):
+        fail("warm_start", f"{len(each.inputs)} plans", f"Give one for each of {len(x)} states")
+    return jax.tree.map(lambda v: np.asarray(v, np.float64), each)
 
 
 def _states(mpc: MPC, name: str, x0s: Reals) -> np.ndarray:
@@ -297,7 +312,7 @@ def _states(mpc: MPC, name: str, x0s: Reals) -> np.ndarray:
 
 @pytree
 class Samples:
-    """States to solve from: x (B, p), and warm starts (z (B, nz), y (B, rows)) or None."""
+    """States to solve from: x (B, p), and warm starts of all or None."""
 
     x: Any
     start: Any = None
@@ -312,49 +327,35 @@ class Samples:
 
 @pytree
 class PenaltyObjective:
-    """The problem, references and iteration for which penalties are tuned.
+    """The controller and references for which penalties are tuned. W: from `interpolation`."""
 
-    W: from `interpolation`. solver: its iterations, eps and smoothing are used.
-    """
-
-    condensed: Condensed
+    controller: Controller
     W: Any
     reference: Any
     input_reference: Any
-    solver: ADMM
-
-    def qp(self, x: Array) -> QP:
-        """Return the quadratic program at a state."""
-        return self.condensed.qp(x, self.reference, self.input_reference)
 
     def digits(self, theta: Any, samples: Samples) -> Array:
-        """Return `digits_of` the rho and alpha of θ."""
+        """Return e (B,) of the rho and alpha of θ; see `solve`."""
         rho, alpha = jnp.exp(theta["log_rho"] @ self.W.T), 2 * jax.nn.sigmoid(theta["alpha"])
-        return self.digits_of(rho, alpha, samples)
+        return self.solve(rho, alpha, samples)[1]
 
-    def digits_of(self, rho: Array, alpha: Array, samples: Samples) -> Array:
-        """Return e (B,): log10 of the norm of all residuals over their tolerances."""
-        solver, c = replace(self.solver, rho=rho, alpha=alpha), self.condensed
-        made = c.factor(solver)
-        eps = solver.eps
+    def solve(self, rho: Array, alpha: Array, samples: Samples) -> tuple[Array, Array]:
+        """Return of the plans of the samples the status (B,), and e (B,): log10 of the norm of all
+        residuals over their tolerances."""
+        solver = replace(self.controller.solver, rho=rho, alpha=alpha)
+        controller, mpc = with_solver(self.controller, solver), self.controller.mpc
+        n, floor = mpc.system.n, rounding(controller.dtype)
 
-        def one(sample: Samples) -> Array:
-            qp = self.qp(sample.x)
-            p = ScaledProgram.of(qp, made)
-            t = jnp.zeros_like(qp.l)
-            if sample.start is not None:
-                t = warm(p, sample.start)
-            t, _ = iterate(splittings(made, p.q), p.bounds, t, solver.admm_steps(), solver.alpha)
-            w, y = read(made, t, p.q, p.bounds)
-            typical = p.typical_sizes(w, y)
-            z, y = p.unscaled(w, y)
-            floor = 100 * jnp.finfo(z.dtype).eps
-            # A quarter of the rounding stays, for the sake of the logarithm's slope at 0.
-            parts = zip(*residual_terms(qp, z, y, typical), strict=True)
-            values, sizes, terms = map(jnp.concatenate, parts)
-            allowed = eps * sizes + floor * (sizes + terms)
+        def one(sample: Samples) -> tuple[Array, Array]:
+            x, previous = sample.x[:n], sample.x[n:] if mpc.input_in_state else None
+            aim = Aim(x, self.reference, self.input_reference, previous)
+            plan, found = plan_with(solve_factored, controller, aim, sample.start)
+            parts = stated_terms(controller, found.y, plan.states, plan.inputs, aim)
+            values, sizes, terms = map(jnp.concatenate, zip(*parts, strict=True))
+            allowed = solver.eps * sizes + floor * (sizes + terms)
             squares = jnp.sum((values / jnp.where(allowed > 0, allowed, 1.0)) ** 2)
-            return 0.5 * jnp.log10((floor / 4) ** 2 + squares)
+            # A quarter of the rounding stays, for the sake of the logarithm's slope at 0.
+            return plan.status, 0.5 * jnp.log10((floor / 4) ** 2 + squares)
 
         return jax.vmap(one)(samples)
 
@@ -404,14 +405,8 @@ def _solve_batch(
     rho: Array, alpha: Array, objective: PenaltyObjective, samples: Samples
 ) -> tuple[Array, Array]:
     """Return status and residual over its tolerance (B,) of a batch, in JAX."""
-    c, solver = objective.condensed, replace(objective.solver, rho=rho, alpha=alpha)
-    made = c.factor(solver)
-
-    def one(sample: Samples) -> Array:
-        found = solve_factored(objective.qp(sample.x), made, solver, sample.start)
-        return with_fault(*found).status
-
-    return jax.vmap(one)(samples), 10.0 ** objective.digits_of(rho, alpha, samples)
+    status, e = objective.solve(rho, alpha, samples)
+    return status, 10.0**e
 
 
 def score(status: np.ndarray, worst: np.ndarray) -> dict[str, float]:

@@ -69,8 +69,7 @@ def test_gradient_against_differences():
     start = rng.normal(size=(64, 5)), rng.normal(size=(64, rows))
     references = np.array([0.3, 0.1]), None
     objective = tuning_solver._objective(mpc(), 30, 2, "step", DEFAULT, references)
-    given = objective.condensed, x, start, Settings(validation=0.5)
-    samples, _ = tuning_solver._samples(mpc(), *given)
+    samples, _ = tuning_solver._samples(objective.controller, x, start, Settings(validation=0.5))
     parameters = objective.W.shape[1]
     theta = {"log_rho": 0.3 * rng.normal(size=(2, parameters)), "alpha": np.array(1.2)}
     with jax.enable_x64(True):
@@ -83,6 +82,26 @@ def test_gradient_against_differences():
             difference = (value(move(1e-5)) - value(move(-1e-5))) / 2e-5
             product = np.sum(slope["log_rho"] * d["log_rho"]) + slope["alpha"] * d["alpha"]
             assert product == pytest.approx(difference, rel=1e-4)
+
+
+@pytest.mark.slow
+def test_what_is_counted_is_what_solve_solves(learned):
+    """With a reference and warm starts: `after` counts the very plans of `jm.solve`."""
+    rng, x = np.random.default_rng(3), states(40, 5)
+    start = rng.normal(size=(40, 5)), rng.normal(size=(40, 17))
+    given = replace(learned[0].solver, iterations=learned[0].solver.iterations)
+    with jax.enable_x64(True):
+        controller = jm.Controller(jax.tree.map(np.float64, mpc()), given)
+        starts = tuning_solver._warm_starts(controller, x, start)
+        one = lambda c, x, start, r: c.plan(x, r, start).status
+        run = jax.jit(jax.vmap(one, in_axes=(None, 0, 0, None)))
+        for target in ([0.0, 0.0], [0.4, 0.0], [3.5, 0.5]):
+            objective = tuning_solver._objective(mpc(), 30, 2, "step", given, (target, None))
+            found, _ = tuning_solver.solve_samples(
+                given.rho, given.alpha, objective, tuning_solver.Samples(x, starts), 40
+            )
+            expected = run(controller, x, starts, np.asarray(target))
+            assert np.array_equal(found, expected)
 
 
 @pytest.mark.parametrize("rate", [1e9, -10.0])
@@ -298,6 +317,4 @@ def test_warm_starts_have_penalties_of_their_own():
             np.mean(run(jm.Controller(controller.mpc, s), x, near) == jm.Status.SOLVED)
             for s in (found.solver, cold.solver)
         ]
-    # The search counts quadratic programs, of which it solves more from warm starts; plans, as
-    # stated, are judged more strictly: of two good searches rounding decides which is ahead.
-    assert share[0] > share[1] - 0.02
+    assert share[0] > share[1]
