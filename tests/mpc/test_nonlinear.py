@@ -219,13 +219,13 @@ class TestDerivatives:
                 problem, tasks=(*problem.tasks, replace(task, weight=theta[0], target=theta[1:3])),
                 mpc=replace(problem.mpc, Q=0.1 * jnp.eye(2) * theta[4]),
             )  # fmt: skip
-            given = {"solver": jm.ADMM(eps=1e-9), "iterations": 200}  # it takes 90 to 100
-            plan = solve_nonlinear(problem, START + theta[5:], GOAL, **given)
-            return plan.inputs.ravel(), (plan.status, plan.multipliers)
+            plan = solve_nonlinear(problem, START + theta[5:], GOAL, jm.ADMM(eps=1e-9))
+            return plan.inputs.ravel(), (plan.status, plan.multipliers, plan.iterations)
 
         theta = jnp.array([0.7, 0.2, -0.1, 1.0, 1.0, 0.0, 0.0])
-        J, (status, multipliers) = jax.jacrev(inputs, has_aux=True)(theta)
-        assert status == SOLVED
+        J, (status, multipliers, iterations) = jax.jacrev(inputs, has_aux=True)(theta)
+        # 90, at half steps, where corrections leave out that rows bend.
+        assert status == SOLVED and iterations < 75
         assert np.sum(np.abs(multipliers.tasks[0]) > 1e-3) >= 1  # the disc is touched
         np.testing.assert_allclose(J, jax.jacfwd(inputs, has_aux=True)(theta)[0], atol=1e-9)
         h = 1e-4

@@ -6,8 +6,8 @@ f(x_k, u_k) − x_{k+1}. The step to the QP's solution is shortened until the me
 
     φ = J + penalties of soft rows + Σ w |defect| + Σ w (violation of hard rows)
 
-falls by a part of what the QP predicts (Armijo), after a second-order correction of the states
-where the whole step does not lower it. φ is exact where each weight w exceeds its
+falls by a part of what the QP predicts (Armijo), after a second-order correction where the whole
+step does not lower it. φ is exact where each weight w exceeds its
 multiplier; Powell's rule, w ← max(|λ|, (w + |λ|)/2), keeps that with λ of the QP (Nocedal, Wright
 2006, §18.3). One QP a time step, with a full step from the last plan shifted by one, is the
 real-time iteration (Diehl, Bock, Schlöder 2005).
@@ -32,7 +32,12 @@ from jaxmpc.arrays import Reals, all_finite
 from jaxmpc.checks import fail, require_kind, whole
 from jaxmpc.mpc.plan import Aim, Plan, WarmStart, answer, checked_aim, checked_array
 from jaxmpc.mpc.rows import dynamics_terms, row_count, split, spread
-from jaxmpc.mpc.stagewise.newton_steps import INTERIOR_STEPS, Search, stage_conditions
+from jaxmpc.mpc.stagewise.newton_steps import (
+    INTERIOR_STEPS,
+    Search,
+    stage_conditions,
+    stage_newton_step,
+)
 from jaxmpc.mpc.stagewise.nonlinear import (
     NonlinearMPC,
     all_rows,
@@ -276,8 +281,8 @@ class Merit:
 
     def value(
         self, s: Stages, base: Stages, problem: NonlinearMPC, x: Array, u: Array
-    ) -> tuple[Array, Array, Array]:
-        """Return φ at x, u, the sum of its terms' sizes, and the defects; s: an expansion."""
+    ) -> tuple[Array, Array]:
+        """Return φ at x, u and the sum of its terms' sizes; s: an expansion."""
         rows = rows_of(s, base, problem, x, u)
         gap = jax.vmap(problem.model.step)(x[:-1], u) - x[1:]
         parts = [
@@ -286,7 +291,7 @@ class Merit:
             jnp.sum(self.defects * jnp.abs(gap)),
             jnp.sum(self.rows * jnp.abs(s.bounds.violation(rows))),
         ]
-        return jnp.sum(jnp.stack(parts)), jnp.sum(jnp.abs(jnp.stack(parts))), gap
+        return jnp.sum(jnp.stack(parts)), jnp.sum(jnp.abs(jnp.stack(parts)))
 
     def decrease(self, s: Stages, dx: Array, du: Array) -> Array:
         """Return by how much φ falls along the whole step dx, du in the expansion."""
@@ -401,15 +406,16 @@ def sqp_step(most: int, hessian: str, constants: tuple, state: Iterate) -> Itera
         s = where_hessian(exact, bent, s)
     fixed = jnp.where(E == 0, s.bounds.penalty_gradient(s.rows(x, u)), 0.0)
     u_qp, y_qp, usable = precisely(solved_qp, s, E, rho, fixed, eps, u, y, exact)
-    dx, du, dy = predict(s, u_qp) - x, u_qp - u, y_qp - y
+    du, dy = u_qp - u, y_qp - y
 
     merit = state.merit.raised(costates(s, u_qp, y_qp)[1:], y_qp)
-    search, predicted, slack = line_search(merit, s, base, problem, dx, du)
+    whole_steps = corrected(s, base, problem, E, rho, u_qp, y_qp)
+    search, predicted, slack = line_search(merit, s, base, problem, whole_steps)
     go = ~solved & search.found & jnp.all(jnp.isfinite(du))
     go = go & (~exact | (usable & (predicted > -slack)))
     length = search.length
     step = lambda v, d: v + jnp.where(go, d, 0.0)
-    x, u, y = step(x, search.dx), step(u, length * du), step(y, length * dy)
+    x, u, y = step(x, search.step[0]), step(u, search.step[1]), step(y, length * dy)
     count = state.steps + ~solved
     exact_next, open_ = go & usable & (length == 1), ~solved & (go | exact) & (count < most)
     return Iterate(x, u, y, merit, count, exact_next, open_)
@@ -417,44 +423,64 @@ def sqp_step(most: int, hessian: str, constants: tuple, state: Iterate) -> Itera
 
 @pytree
 class LineSearch:
-    """Loop state of a line search: the part of the step that was tried last, the states' step
-    (N+1, n) for it, what closes its defects (N+1, n), the attempts made, and whether it is good."""
+    """Loop state of a line search: the part of the step that was tried last, the step in states
+    (N+1, n) and inputs (N, m) for it, the attempts made, and whether it is good."""
 
     length: Array
-    dx: Array
-    correction: Array
+    step: tuple[Array, Array]
     attempt: Array
     found: Array
 
 
-def line_search(
-    merit: Merit, s: Stages, base: Stages, problem: NonlinearMPC, dx: Array, du: Array
-) -> tuple[LineSearch, Array, Array]:
-    """Return where the search for a step along dx, du ends that lowers the merit by a part of what
-    the expansion predicts, the decrease predicted, and its rounding.
+def corrected(
+    s: Stages, base: Stages, problem: NonlinearMPC, E: Array, rho: Array, u: Array, y: Array
+) -> tuple[Array, Array]:
+    """Return whole steps in states (3, N+1, n) and inputs (3, N, m): to the solution u, y of the QP
+    s; the same inputs with states that close its defects to first order; and what a Newton step
+    leads to on the QP whose dynamics and rows have the values of the model there.
 
-    The whole step is tried first, then the same inputs with the states moved by what closes its
-    defects to first order, then half the step and so on. Near a solution the defects of whole
-    steps, second-order terms times large weights, exceed what the cost gains (Maratos 1978; the
-    correction: Nocedal, Wright 2006, §18.3).
+    Near a solution the defects and violations of whole steps, second-order terms times large
+    weights, exceed what the cost gains (Maratos 1978; second-order corrections: Nocedal, Wright
+    2006, §18.3).
+    """
+    x = predict(s, u)
+    gap = jax.vmap(problem.model.step)(x[:-1], u) - x[1:]
+    bend = rows_of(s, base, problem, x, u) - s.rows(x, u)
+    bounds = replace(s.bounds, l=s.bounds.l - bend, u=s.bounds.u - bend)
+    there = replace(s, c=s.c + gap, bounds=bounds)
+    u_there, _ = precisely(stage_newton_step, there, E, rho, u, y)
+    states = jnp.stack([x, predict(there, u), predict(there, u_there)])
+    return states - s.aim.states, jnp.stack([u, u, u_there]) - s.aim.inputs
+
+
+def line_search(
+    merit: Merit,
+    s: Stages,
+    base: Stages,
+    problem: NonlinearMPC,
+    whole_steps: tuple[Array, Array],
+) -> tuple[LineSearch, Array, Array]:
+    """Return where the search ends for a step that lowers the merit by a part of what the expansion
+    predicts, the decrease predicted, and its rounding.
+
+    The whole steps are tried first, one after the other, then half of the first and so on.
     """
     x, u = s.aim.states, s.aim.inputs
     value = partial(merit.value, s, base, problem)
-    (now, size, _), predicted = value(x, u), merit.decrease(s, dx, du)
+    step = whole_steps[0][0], whole_steps[1][0]
+    (now, size), predicted = value(x, u), merit.decrease(s, *step)
     slack = 10 * jnp.finfo(x.dtype).eps * size
 
     def attempt(search: LineSearch) -> LineSearch:
         k = search.attempt
-        length = jnp.where(k < 2, 1.0, search.length / 2)
-        moved = length * dx + jnp.where(k == 1, search.correction, 0.0)
-        after, _, gap = value(x + moved, u + length * du)
+        count = len(whole_steps[0])
+        length = jnp.where(k < count, 1.0, search.length / 2)
+        dx, du = (length * v[jnp.where(k < count, k, 0)] for v in whole_steps)
+        after, _ = value(x + dx, u + du)
         found = after <= now - DECREASE * length * predicted + slack
-        closing = recurrence(s.A, gap, jnp.zeros_like(x[0]))
-        correction = jnp.concatenate([jnp.zeros_like(x[:1]), closing])
-        return LineSearch(length, moved, correction, k + 1, found)
+        return LineSearch(length, (dx, du), k + 1, found)
 
-    one, none = jnp.ones((), x.dtype), jnp.zeros_like(dx)
-    begin = LineSearch(one, none, none, jnp.int32(0), jnp.asarray(False))
+    begin = LineSearch(jnp.ones((), x.dtype), step, jnp.int32(0), jnp.asarray(False))
     go_on = lambda search: ~search.found & (search.length > SHORTEST)
     return jax.lax.while_loop(go_on, attempt, varying(begin, x)), predicted, slack
 
