@@ -211,8 +211,8 @@ def rest_at(robot: RobotDescription, q: np.ndarray, *, within: bool = False) -> 
     return forces.rest(q, drive, f)
 
 
-# Weights of the inputs, of their half-widths, and of normal forces, beside that of tangential
-# forces, of the weight; and of the balance.
+# Weights of the inputs, relative to their half-widths or to what the weight asks of them, and of
+# normal forces, beside that of tangential forces, all relative to the weight; and of the balance.
 _EFFORT, _NORMAL, _BALANCE = 1e-2, 1e-4, 1e6
 
 
@@ -225,22 +225,25 @@ def _standing(forces: Forces, feet: Feet, q: np.ndarray) -> Rest:
     cones, and the balance has a large weight (Lawson & Hanson, ch. 22)."""
     J, f = forces.affine(q)
     G, R = feet.jacobian(forces.model, forces.data), feet.edges()
-    sizes = forces.sizes(f)
-    size = float(np.abs(f).max()) or float(sizes.max())
-    width = np.minimum((forces.upper - forces.lower) / 2, size)
-    on_feet = np.sqrt(np.tile([_NORMAL, 1.0, 1.0], len(feet))) * len(feet) / size
-    balance = _BALANCE / size
-    rows = np.vstack(
-        [
-            balance * np.hstack([J, G.T @ R]),
-            block_diag(np.diag(np.sqrt(_EFFORT) / width), on_feet[:, None] * R),
-        ]
-    )
-    aim = np.append(-balance * f, np.zeros(forces.m + len(on_feet)))
+    sizes, model = forces.sizes(f), forces.model
+    weight = float(np.linalg.norm(model.opt.gravity) * model.body_mass.sum()) or 1.0
+    # What a coordinate takes where a foot carries the weight, in the coordinate's own unit.
+    most = np.maximum(np.abs(f), weight * np.abs(G).max(axis=0))
+    most = np.where(most > 0, most, sizes)
+    needed = np.max(np.abs(J) / most[:, None], axis=0)
+    width = 1 / np.maximum(np.maximum(2 / (forces.upper - forces.lower), needed), 1e-300)
+    # In units in which widths, the weight and `most` are 1.
+    unit = np.append(width, np.full(R.shape[1], weight))
+    on_feet = np.sqrt(np.tile([_NORMAL, 1.0, 1.0], len(feet))) * len(feet)
+    effort = block_diag(np.sqrt(_EFFORT) * np.eye(forces.m), on_feet[:, None] * R)
+    balance = _BALANCE / most
+    rows = np.vstack([balance[:, None] * np.hstack([J, G.T @ R]) * unit, effort])
+    aim = np.append(-balance * f, np.zeros(len(effort)))
     lower = np.append(forces.lower, np.zeros(R.shape[1]))
     upper = np.append(forces.upper, np.full(R.shape[1], np.inf))
-    found = scipy.optimize.lsq_linear(rows, aim, (lower, upper), method="bvls", tol=1e-15)
-    drive, r = np.split(found.x, [forces.m])
+    bounds = lower / unit, upper / unit
+    found = scipy.optimize.lsq_linear(rows, aim, bounds, method="bvls", tol=1e-15)
+    drive, r = np.split(unit * found.x, [forces.m])
     missing = forces.at(q, drive) + G.T @ (R @ r)
     return Rest(q, *forces.parts(drive), drive, forces.lower, forces.upper, missing, sizes)
 

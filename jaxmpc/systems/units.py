@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxmpc.qp.jax_transformations import varying
 from jaxmpc.qp.linalg import namespace
 
 # Entries this much smaller than others of their row and of their column are rounding: couplings
@@ -87,6 +88,7 @@ def natural_units(A: Any, B: Any, Q: Any = None, R: Any = None) -> Units:
             for _ in range(_SWEEPS):
                 logs = sweep(parts, logs)
             return logs
+        logs = varying(logs, (A, B, Q, R))
         return jax.lax.fori_loop(0, _SWEEPS, lambda _, logs: sweep(parts, logs), logs)
 
     logs = settled((others, B), (xp.zeros(n, dtype), xp.zeros(m, dtype), xp.zeros((), dtype)))

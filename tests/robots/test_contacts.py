@@ -119,6 +119,31 @@ def test_rest_on_a_foot(standing):
 
 
 @pytest.mark.slow
+def rescaled(model, length, mass):
+    """The same robot with its feet in other units of length and mass."""
+    model, torque = copy.deepcopy(model), mass * length**2
+    for name in ("body_pos", "body_ipos", "geom_pos", "geom_size", "jnt_pos", "site_pos"):
+        getattr(model, name)[:] *= length
+    for name in ("dof_armature", "dof_damping", "actuator_ctrlrange", "body_inertia"):
+        getattr(model, name)[:] *= torque
+    for q in (model.qpos0, *model.key_qpos):
+        q[:3] *= length
+    model.opt.gravity[:] *= length
+    model.body_mass[:] *= mass
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    return model
+
+
+def test_units_do_not_decide_how_feet_share_the_weight(quadruped):
+    feet = [quadruped.mujoco.geom(i).name for i in np.flatnonzero(quadruped.mujoco.geom_contype)]
+    assert len(feet) == 4
+    _, expected = quadruped.standing(feet, friction=0.5).equilibrium()
+    for length, mass in ((64.0, 1.0), (1 / 32, 1024.0), (8.0, 1 / 4096)):
+        robot = jm.load_robot(rescaled(quadruped.mujoco, length, mass))
+        _, u = robot.standing(feet, friction=0.5).equilibrium()
+        np.testing.assert_allclose(u / (mass * length**2), expected, atol=1e-8)
+
+
 def test_linear_model_against_the_c_engine(standing):
     """A and B of a period are the slopes of the balance of forces, cones of its forces."""
     x, u = standing.equilibrium()
