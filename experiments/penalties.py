@@ -10,8 +10,9 @@ States: uniform in the state limits (arm2: a box about home; product: each joint
 as the product is; springs8_30: denser near the origin), those that `map_feasible_set` proves
 feasible. Learning and the choice of the constant see the first part only; both judge on the rest.
 
-default: rho = 1, alpha = 1.6. constant: best of a grid of rho and alpha on states of the first part
-(for "steps to 99 %" the best for that). OSQP: OSQP itself with its scaling and its adaptive
+default: rho of the problem (`ADMM.rho`), alpha = 1.6. constant: best of a grid of rho and alpha on
+states of the first part (for "steps to 99 %" the best for that). OSQP: OSQP itself with its scaling
+and its adaptive
 rho, intervals of 5 to 100 steps, whichever is best, run to the given number of iterations without
 termination checks or polish; its answers judged by our residuals. learned: `tune_solver`;
 for "steps to 99 %" learned anew for each number of steps that was tried.
@@ -301,9 +302,11 @@ def report(s: Settings) -> None:
     rows = table.condensed.C.shape
     print(f"{s.problem}: N = {c.mpc.horizon}, {rows[1]} variables, {rows[0]} rows, {s.steps} steps")
     show = lambda name, share, more="": print(f"  {name:<44}{share:8.2%}  {more}", flush=True)
-    few = np.asarray(run(table.condensed, table.tracked, table.test, 1.0, 1.6))
+    own = table.condensed
+    rho = float(factorise(own.P, own.C, jm.ADMM(), own.balls).rho[0, 0])
+    few = np.asarray(run(own, table.tracked, table.test, rho, 1.6))
     show(
-        "default, rho = 1, alpha = 1.6",
+        f"default, rho = {rho:.2g}, alpha = 1.6",
         table.solved(jm.ADMM(s.steps, newton_steps=0)),
         told(to_99(few)),
     )

@@ -60,6 +60,8 @@ def program(x):
 
 
 def bent(x, u):
+    # Of an array of NumPy in a function that is alive JAX 0.11 and 0.12 keep the type that it had
+    # in the mode in which it was traced first: it is made one of the type of x here.
     return jnp.asarray(A, x.dtype) @ x + jnp.asarray(B, x.dtype) @ u + 0.01 * jnp.sin(x)
 
 
@@ -151,9 +153,7 @@ def of_constants():
         ),
         "stages": lambda x: solve_stagewise(problem(system=moves, inputs=inputs), x).inputs,
         "nonlinear": lambda x: (
-            solve_nonlinear(
-                NonlinearMPC(problem(inputs=inputs), lambda x, u: A @ x + B @ u, (task,)), x
-            ).inputs
+            solve_nonlinear(NonlinearMPC(problem(inputs=inputs), bent, (task,)), x).inputs
         ),
         "disturbance": partial(with_x, control_horizon=2, **robust),
         "gain": partial(with_x, prestabilise=gain),
