@@ -32,7 +32,7 @@ from jaxmpc.robots.force_limits import ForceLimits, force_limits, stopping_limit
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.robot import Robot, RobotModel
 from jaxmpc.sets.convex_sets import Box
-from jaxmpc.systems.riccati import least_reached, lqr
+from jaxmpc.systems.riccati import UNREACHED, least_reached, lqr
 from jaxmpc.systems.system import LinearSystem, host_matrices
 from jaxmpc.systems.units import natural_units
 
@@ -168,7 +168,7 @@ def _terminal_cost(
     leaves out: no input changes that rest.
     """
     A, B, _ = host_matrices(system)
-    if least_reached(A, B)[0] > _UNREACHED:
+    if least_reached(A, B)[0] > UNREACHED:
         return np.asarray(lqr(system, Q, R).P)
     r = host_array("R", R)
     units = natural_units(A, B, Q, r)
@@ -184,10 +184,6 @@ def _terminal_cost(
         )
     reduced = LinearSystem(T.T @ A @ T, T.T @ B)
     return units.cost_matrix(T @ np.asarray(lqr(reduced, T.T @ Q @ T, r).P) @ T.T)
-
-
-# Modes closer than this to unreachable count as such, as in `lqr`.
-_UNREACHED = 1e-10
 
 
 def reached_subspace(A: np.ndarray, B: np.ndarray) -> np.ndarray:

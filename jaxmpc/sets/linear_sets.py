@@ -69,8 +69,19 @@ class LinearSet(BasicSet):
         return self.to_polytope().intersect(other)
 
     def preimage(self, M: Reals, t: Reals | None = None) -> "Polytope":
-        """Return {x : M x + t in the set}, row by row, for any M (n, k)."""
-        return self.to_polytope().preimage(M, t)
+        """Return {x : M x + t in the set} = {x : H M x <= h - H t}, row by row, not reduced.
+
+        Arguments:
+            M: (n, k), any matrix.
+            t: (n,), or None for 0.
+        """
+        P = self.to_polytope()
+        P._require_fields(type(self).__name__)
+        H, h = P.half_spaces()
+        M, t = affine_map(M, t, (P.dimension, None))
+        normals = cleaned(H @ M, np.abs(H) @ np.abs(M))
+        offsets = cleaned(h - H @ t, np.abs(h) + np.abs(H) @ np.abs(t))
+        return Polytope(normals, offsets, P.labels)
 
     def slice(self, values: Mapping[int, float]) -> "LinearSet":
         """Return the section with some coordinates fixed, {axis: value, ...}, in the others: {y :
@@ -86,12 +97,20 @@ class LinearSet(BasicSet):
         The radius of a flat set is 0. Raises ValueError if the set is empty, or holds balls
         of every radius.
         """
-        return self.to_polytope().chebyshev()
+        kind = type(self).__name__
+        center, radius = geometry.largest_ball(kind, *self.to_polytope().unit_rows())
+        if radius == np.inf:
+            fail(kind, "is unbounded: it holds arbitrarily large balls", "Add rows")
+        return center, max(radius, 0.0)
 
     def full_part(self) -> "FullPart":
         """Return the affine hull of the set and the set in its coordinates, where it has volume.
         Raises ValueError if the set is empty."""
-        return self.to_polytope().full_part()
+        hull = self.to_polytope()._hull()
+        if hull is None:
+            fail(type(self).__name__, "is empty: it has no affine hull", "Ask is_empty() first")
+        part = Polytope(hull.G, hull.g) if hull.basis.shape[1] else None
+        return FullPart(hull.shift, hull.basis, part)
 
     def affine_hull(self) -> tuple[np.ndarray, np.ndarray]:
         """Return (E, e) of the affine hull {x : E x = e}, independent rows; none of a set with
@@ -132,6 +151,10 @@ class LinearSet(BasicSet):
     def _covers(self, other: BasicSet, tolerance: float) -> bool:
         rows, offsets = self.to_polytope().unit_rows("other")
         return other._keeps(rows, offsets, tolerance)
+
+    def _keeps(self, rows: np.ndarray, offsets: np.ndarray, tolerance: float) -> bool:
+        room = self._room(rows, offsets, tolerance)
+        return bool(np.all(self.support(rows) <= offsets + room))
 
     def _farthest(self, P: np.ndarray, center: np.ndarray) -> float:
         apart = self.vertices() - center
@@ -236,15 +259,6 @@ class Polytope(LinearSet):
         hull = self._hull()
         return -1 if hull is None else hull.basis.shape[1]
 
-    def full_part(self) -> FullPart:
-        """Return the affine hull of the set and the set in its coordinates, where it has volume.
-        Raises ValueError if the set is empty."""
-        hull = self._hull()
-        if hull is None:
-            fail("Polytope", "is empty: it has no affine hull", "Ask is_empty() first")
-        part = Polytope(hull.G, hull.g) if hull.basis.shape[1] else None
-        return FullPart(hull.shift, hull.basis, part)
-
     def contains(self, x: Reals, tolerance: float = 0.0) -> AnyTruth:
         """Return whether H x <= h + tolerance (in the scale of each row), for a point x (n,) or for
         each of many (k, n)."""
@@ -304,17 +318,6 @@ class Polytope(LinearSet):
         """Return the set itself."""
         return self
 
-    def chebyshev(self) -> tuple[np.ndarray, float]:
-        """Return (center, radius) of the largest ball inside, by one LP.
-
-        The radius of a flat set is 0. Raises ValueError if the set is empty, or holds balls
-        of every radius.
-        """
-        center, radius = geometry.largest_ball("Polytope", *self.unit_rows())
-        if radius == np.inf:
-            fail("Polytope", "is unbounded: it holds arbitrarily large balls", "Add rows")
-        return center, max(radius, 0.0)
-
     def intersect(self, other: LinearSet) -> "Polytope":
         """Return the points in both sets, another being a Box, Polytope or Zonotope: the rows of
         both, not reduced.
@@ -338,20 +341,6 @@ class Polytope(LinearSet):
             fail("factor", f"{factor!r} is not a positive number", "Give a finite factor > 0")
         H, h = self.half_spaces()
         return Polytope(H, h * float(factor))
-
-    def preimage(self, M: Reals, t: Reals | None = None) -> "Polytope":
-        """Return {x : M x + t in the set} = {x : H M x <= h - H t}, row by row, not reduced.
-
-        Arguments:
-            M: (n, k), any matrix.
-            t: (n,), or None for 0.
-        """
-        self._require_fields("Polytope")
-        H, h = self.half_spaces()
-        M, t = affine_map(M, t, (self.dimension, None))
-        normals = cleaned(H @ M, np.abs(H) @ np.abs(M))
-        offsets = cleaned(h - H @ t, np.abs(h) + np.abs(H) @ np.abs(t))
-        return Polytope(normals, offsets, self.labels)
 
     def image(self, M: Reals, t: Reals | None = None) -> "Polytope":
         """Return {M x + t : x in the set}, reduced unless M is square and invertible.
@@ -833,7 +822,7 @@ class Box(LinearSet):
         bounded. Raises ValueError if it is empty, or holds balls of every radius."""
         lower, upper = self._ends()
         if not self.is_bounded() or self.is_empty():
-            return self.to_polytope().chebyshev()
+            return super().chebyshev()
         return (lower + upper) / 2, float((upper - lower).min() / 2)
 
     def sample(self, count: int, seed: int = 0) -> np.ndarray:
@@ -867,10 +856,6 @@ class Box(LinearSet):
 
     def _closest(self, x: np.ndarray) -> np.ndarray:
         return np.clip(x, *self._ends())
-
-    def _keeps(self, rows: np.ndarray, offsets: np.ndarray, tolerance: float) -> bool:
-        room = self._room(rows, offsets, tolerance)
-        return bool(np.all(self.support(rows) <= offsets + room))
 
     def _require_fields(self, argument: str, dimension: int | None = None) -> None:
         require_matching(argument, {"lower": self.lower, "upper": self.upper}, 1, dimension)
@@ -1070,10 +1055,6 @@ class Zonotope(LinearSet):
         size = np.abs(G).max()
         found = scipy.optimize.lsq_linear(G / size, (x - center) / size, (-1, 1), "bvls", tol=1e-15)
         return center + G @ found.x
-
-    def _keeps(self, rows: np.ndarray, offsets: np.ndarray, tolerance: float) -> bool:
-        room = self._room(rows, offsets, tolerance)
-        return bool(np.all(self.support(rows) <= offsets + room))
 
     def _values(self) -> tuple[np.ndarray, np.ndarray]:
         self.validate("Zonotope")

@@ -18,7 +18,7 @@ from jaxmpc.systems.system import LinearSystem
 from jaxmpc.systems.units import natural_units
 
 # Modes closer than this to unreachable (least singular value, relative) count as such.
-_UNREACHED = 1e-10
+UNREACHED = 1e-10
 # Doublings at most: 2^40 steps of a loop with spectral radius 1 - 1e-10 leave 1e-48.
 _DOUBLINGS = 40
 # Relative residual of the Riccati equation above which a traced P is no solution.
@@ -90,9 +90,9 @@ def lqr(system: LinearSystem, Q: Reals, R: Reals) -> LQR:
     (control, _), (cost, _) = _least(moved), _least(seen)
     unmoved = f"does not move {_described(moved, system.state_names)}"
     unseen = f"puts no weight on {_described(seen, system.state_names)}"
-    if control <= _UNREACHED:
+    if control <= UNREACHED:
         fail("B", f"not stabilizable: {unmoved}", "Actuate that")
-    if cost <= _UNREACHED:
+    if cost <= UNREACHED:
         fail("Q", f"not detectable: {unseen}", "Give it some")
     try:
         P = _refine(A, B, q, r, scipy.linalg.solve_discrete_are(A, B, q, r))
@@ -329,7 +329,7 @@ def _described(tests: list[_RankTest], names: Sequence[str], most: int = 6) -> s
     """Return the unreached modes in words: the coordinates in which a left null vector of a test,
     or of the test that comes nearest to one, has more than a tenth of its largest entry."""
     least, mode = _least(tests)
-    unreached = [test.vectors[:, test.values <= max(_UNREACHED, least)] for test in tests]
+    unreached = [test.vectors[:, test.values <= max(UNREACHED, least)] for test in tests]
     entries = np.abs(np.hstack(unreached)) if tests else np.zeros((0, 1))
     large = np.any(entries > 0.1 * entries.max(axis=0, initial=0.0), axis=1)
     found = [names[i] if names else f"coordinate {i}" for i in np.flatnonzero(large).tolist()]
