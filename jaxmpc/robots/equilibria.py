@@ -19,8 +19,8 @@ from jaxmpc.robots.description import RobotDescription
 from jaxmpc.robots.mujoco_access import flag, mujoco, name_of, single_joints
 from jaxmpc.sets.convex_sets import Box
 
-# Forces that count as balanced, relative to `Forces.sizes`.
-BALANCED = 1e-6
+# Forces that count as balanced, relative to `Forces.sizes`: of a pendulum, an angle in radians.
+BALANCED = 3e-7
 # Of the largest of these sizes: below it rounding of the large forces decides.
 _LEAST = 1e-6
 # Accelerations (rad/s², m/s²) that count as rest.
@@ -127,17 +127,29 @@ class Forces:
 
     def sizes(self, f: np.ndarray) -> np.ndarray:
         """Return the sizes (nv,) of the forces at the position in `data`: of f (nv,), those there
-        without inputs, and of those that give each coordinate alone the acceleration of gravity.
+        without inputs, and of those that gravity has on what each coordinate moves, as far from the
+        axis as its radius of gyration.
 
-        So a robot of milligrams is measured as one of tons is, and a finger as its arm.
+        So a robot of milligrams is measured as one of tons is, a finger as its arm, and a turn as a
+        slide, in any unit of length: g √(inertia · mass) is g · mass of a slide.
         """
-        inertia, gravity = np.zeros_like(f), np.linalg.norm(self.model.opt.gravity)
+        model, inertia = self.model, np.zeros_like(f)
         for i, axis in enumerate(np.eye(len(f))):
             column = np.zeros_like(f)
-            mujoco.mj_mulM(self.model, self.data, column, axis)
+            mujoco.mj_mulM(model, self.data, column, axis)
             inertia[i] = column[i]
-        sizes = np.abs(f) + (1 + gravity) * inertia
-        return np.maximum(sizes, _LEAST * sizes.max(initial=0.0))
+        gravity = float(np.linalg.norm(model.opt.gravity)) or 1.0
+        mass = model.body_subtreemass[model.dof_bodyid]
+        sizes = np.abs(f) + gravity * np.sqrt(inertia * mass)
+        return np.maximum(sizes, _LEAST * np.max(sizes, initial=0.0))
+
+    def widths(self, J: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+        """Return the sizes (m,) of drives: half of what their limits leave, and no more than what
+        takes a coordinate through its size (nv,). J as in `affine`."""
+        needed = np.max(np.abs(J) / sizes[:, None], axis=0, initial=0.0)
+        range_ = self.upper - self.lower
+        limited = np.where(range_ > 0, 2 / np.where(range_ > 0, range_, 1.0), 0.0)
+        return 1 / np.maximum(np.maximum(limited, needed), 1e-300)
 
     def uncoupled(self, force: np.ndarray) -> np.ndarray:
         """Return the part (nv,) of generalised forces, at the position in `data`, that couplings do
@@ -197,16 +209,20 @@ class Forces:
 
 def rest_at(robot: RobotDescription, q: np.ndarray, *, within: bool = False) -> Rest:
     """Return the robot at rest in q (nq,) under the drive that comes nearest to a balance: the
-    least one of all inputs, or one within the limits."""
+    least one of all inputs, each relative to its size, or one within the limits."""
     forces = Forces(robot)
     if forces.feet is not None:
         return _standing(forces, forces.feet, q)
     q = forces.couplings.met(q)
     J, f = forces.affine(q)
-    drive = np.linalg.lstsq(J, -f, rcond=None)[0]
+    sizes = forces.sizes(f)
+    unit = forces.widths(J, sizes)
+    rows, aim = J / sizes[:, None] * unit, -f / sizes
+    drive = unit * np.linalg.lstsq(rows, aim, rcond=None)[0]
     if within and np.any((drive < forces.lower) | (drive > forces.upper)):
         wide = np.where(forces.upper > forces.lower, 0.0, 1e-12)
-        drive = scipy.optimize.lsq_linear(J, -f, (forces.lower - wide, forces.upper + wide)).x
+        bounds = forces.lower / unit - wide, forces.upper / unit + wide
+        drive = unit * scipy.optimize.lsq_linear(rows, aim, bounds).x
         drive = np.clip(drive, forces.lower, forces.upper)
     return forces.rest(q, drive, f)
 
@@ -230,10 +246,8 @@ def _standing(forces: Forces, feet: Feet, q: np.ndarray) -> Rest:
     # What a coordinate takes where a foot carries the weight, in the coordinate's own unit.
     most = np.maximum(np.abs(f), weight * np.abs(G).max(axis=0))
     most = np.where(most > 0, most, sizes)
-    needed = np.max(np.abs(J) / most[:, None], axis=0)
-    width = 1 / np.maximum(np.maximum(2 / (forces.upper - forces.lower), needed), 1e-300)
     # In units in which widths, the weight and `most` are 1.
-    unit = np.append(width, np.full(R.shape[1], weight))
+    unit = np.append(forces.widths(J, most), np.full(R.shape[1], weight))
     on_feet = np.sqrt(np.tile([_NORMAL, 1.0, 1.0], len(feet))) * len(feet)
     effort = block_diag(np.sqrt(_EFFORT) * np.eye(forces.m), on_feet[:, None] * R)
     balance = _BALANCE / most

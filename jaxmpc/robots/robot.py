@@ -140,8 +140,9 @@ class Robot(RobotDescription):
         it.
 
         q: None for that of `home`; (..., nq) for many. The input (or the activation, where an
-        actuator has one) balances gravity and passive forces, the least one where there are
-        several. Couplings carry what they can; their springs yield a little, so x lies next to q
+        actuator has one) balances gravity and passive forces; where several do, the one of least
+        squares, each input relative to half its range, or to what the load asks of it if that is
+        less. Couplings carry what they can; their springs yield a little, so x lies next to q
         there. near (nq,), in place of q: the configuration nearest to it that inputs within the
         limits hold, inside the position limits: a local search, least squares of the forces and
         of the motion. Limits' springs, contacts and dry friction do not help. Computed

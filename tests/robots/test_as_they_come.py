@@ -132,6 +132,37 @@ def test_no_unit_of_forces_decides_what_rests(mass):
             arms[1].inverse_dynamics(q, nothing, nothing)
 
 
+LIFT = """
+<mujoco><compiler angle="radian"/><option gravity="0 0 {g}"/><worldbody>
+<body><joint name="slide" type="slide" axis="0 0 1"/><geom type="sphere" size="{r}" mass="{two}"/>
+<body><joint name="turn" axis="0 1 0"/>
+<geom type="capsule" fromto="0 0 0 {reach} 0 0" size="{r}" mass="{one}"/></body>
+</body></worldbody><actuator>
+<motor joint="slide" ctrlrange="-{a} {a}"/><motor joint="slide" ctrlrange="-{b} {b}"/>
+<motor joint="turn" ctrlrange="-{c} {c}"/><motor joint="turn" ctrlrange="-{d} {d}"/>
+</actuator></mujoco>"""
+
+
+def test_no_unit_of_length_or_mass_decides_how_inputs_share_a_load():
+    """A lift and a hinge with two motors each: N beside N m."""
+
+    def shares(length, mass):
+        force, torque = mass * length, mass * length**2
+        text = LIFT.format(
+            g=-9.81 * length, r=0.02 * length, reach=0.4 * length, one=mass, two=2 * mass,
+            a=100 * force, b=50 * force, c=1.5 * torque, d=40 * torque,
+        )  # fmt: skip
+        _, u = load(text).equilibrium(np.zeros(2))
+        return u / np.array([force, force, torque, torque])
+
+    expected = shares(1.0, 1.0)
+    np.testing.assert_allclose(expected[:2].sum(), 3 * 9.81, rtol=1e-12)
+    np.testing.assert_allclose(expected[2:].sum(), -0.2 * 9.81, rtol=1e-12)
+    assert abs(expected[2]) < abs(expected[3])  # the weak motor takes less
+    for length, mass in ((64.0, 1.0), (1 / 64, 1024.0), (1000.0, 1e-3)):
+        np.testing.assert_allclose(shares(length, mass), expected, rtol=1e-9)
+
+
 WALKER = """
 <mujoco><worldbody><geom type="plane" size="2 2 .1"/>
 <body pos="0 0 .3"><freejoint name="root"/><geom size=".1" mass="3"/>
