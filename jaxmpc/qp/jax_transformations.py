@@ -531,6 +531,12 @@ def all_batched(out: R) -> tuple[R, Any]:
     return out, jax.tree.map(lambda _: True, out)
 
 
+def unbatched(out: R) -> tuple[R, Any]:
+    """Return what a rule of batching does where no argument is batched, as in derivatives of which
+    the tangents alone are."""
+    return out, jax.tree.map(lambda _: False, out)
+
+
 def true_places(mask: Array, size: int) -> Array:
     """Return the first `size` places where mask (m,) is true as int32, filled up with m.
 

@@ -32,7 +32,13 @@ from jax import Array, lax
 from jax.custom_batching import custom_vmap
 from jax.typing import DTypeLike
 
-from jaxmpc.qp.jax_transformations import all_batched, broadcast, own_modes, varying
+from jaxmpc.qp.jax_transformations import (
+    all_batched,
+    broadcast,
+    own_modes,
+    unbatched,
+    varying,
+)
 
 T = TypeVar("T")
 A = TypeVar("A", Array, np.ndarray)
@@ -224,13 +230,16 @@ def batched(
         size = together // (n * n * max(n, args[-1].shape[-1]))
         return lax.map(lambda each: each_on_cpu(*each), args, batch_size=min(max(size, 1), batch))
 
-    @custom_vmap
-    def many(*args: Array) -> Any:
+    def each(*args: Array) -> Any:
         return lax.platform_dependent(*args, cpu=on_cpu, default=jax.vmap(one))
+
+    many = custom_vmap(each)
 
     @many.def_vmap
     @own_modes
     def _(size: int, in_batched: Any, *args: Array) -> Any:
+        if not any(in_batched):
+            return unbatched(each(*args))
         args = broadcast(size, tuple(in_batched), args)
         out = many(*(v.reshape(-1, *v.shape[2:]) for v in args))
         return all_batched(jax.tree.map(lambda v: v.reshape(size, -1, *v.shape[1:]), out))
@@ -240,6 +249,8 @@ def batched(
     @single.def_vmap
     @own_modes
     def _(size: int, in_batched: Any, *args: Array) -> Any:
+        if not any(in_batched):
+            return unbatched(one(*args))
         if columns and not in_batched[0]:
             M, B = args
             out = single(M, jnp.moveaxis(B, 0, -1).reshape(len(M), -1))

@@ -35,6 +35,7 @@ from jax import Array
 from jax.custom_batching import custom_vmap
 
 from jaxmpc.pytrees import record
+from jaxmpc.qp.jax_transformations import unbatched
 from jaxmpc.robots.mujoco_access import BALL, FREE, SLIDE
 
 # What is read of mjx.Model.
@@ -445,16 +446,19 @@ def side_by_side(function: Callable) -> Callable:
         out = function(*jax.tree.map(lambda v: v[..., None], args))
         return jax.tree.map(lambda v: v[..., 0], out)
 
-    @custom_vmap
-    def many(*args: Any) -> Any:  # the batch first, of size 1 where it is shared
+    def plain(*args: Any) -> Any:  # the batch first, of size 1 where it is shared
         count = max(len(v) for v in jax.tree.leaves(args))
         whole = lambda v: jnp.broadcast_to(v, (count, *v.shape[1:]))
         out = function(*jax.tree.map(lambda v: jnp.moveaxis(whole(v), 0, -1), args))
         first = lambda v: jnp.moveaxis(jnp.broadcast_to(v, (*v.shape[:-1], count)), -1, 0)
         return jax.tree.map(first, out)
 
+    many = custom_vmap(plain)
+
     @many.def_vmap
     def _(size: int, in_batched: Any, *args: Any) -> Any:
+        if not any(jax.tree.leaves(in_batched)):
+            return unbatched(plain(*args))
         lengths = jax.tree.map(lambda v, b: v.shape[1 if b else 0], args, tuple(in_batched))
         count = max(jax.tree.leaves(lengths))
 
@@ -473,6 +477,8 @@ def side_by_side(function: Callable) -> Callable:
 
     @batched.def_vmap
     def _(size: int, in_batched: Any, *args: Any) -> Any:
+        if not any(jax.tree.leaves(in_batched)):
+            return unbatched(single(*args))
         out = many(*jax.tree.map(lambda v, b: v if b else v[None], args, tuple(in_batched)))
         return out, jax.tree.map(lambda _: True, out)
 
