@@ -12,10 +12,9 @@ feasible. Learning and the choice of the constant see the first part only; both 
 
 default: rho of the problem (`ADMM.rho`), alpha = 1.6. constant: best of a grid of rho and alpha on
 states of the first part (for "steps to 99 %" the best for that). OSQP: OSQP itself with its scaling
-and its adaptive
-rho, intervals of 5 to 100 steps, whichever is best, run to the given number of iterations without
-termination checks or polish; its answers judged by our residuals. learned: `tune_solver`;
-for "steps to 99 %" learned anew for each number of steps that was tried.
+and its adaptive rho, intervals of 5 to 100 steps, whichever is best, run to the given number of
+iterations without termination checks or polish; its answers judged by our residuals. learned:
+`tune_solver`; for "steps to 99 %" learned anew for each number of steps that was tried.
 """
 
 import time

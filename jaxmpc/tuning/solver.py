@@ -128,7 +128,8 @@ def tune_solver(
     if chosen.optimizer is None:  # its schedule knows their number; with another, a run may grow
         decides["updates"] = chosen.updates
     tracked, penalties = (objective.reference, objective.input_reference), (solver.rho, given.alpha)
-    data = in_float64(mpc), tracked, objective.controller.solver, train, test, penalties
+    controller = objective.controller
+    data = controller.mpc, tracked, controller.solver, train, test, penalties
     decides["fingerprint"] = fingerprint(decides, data)
 
     def tune() -> TuningRun:

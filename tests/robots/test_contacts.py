@@ -118,7 +118,6 @@ def test_rest_on_a_foot(standing):
     np.testing.assert_allclose(after, host_coordinates(standing, x), atol=1e-12)
 
 
-@pytest.mark.slow
 def rescaled(model, length, mass):
     """The same robot with its feet in other units of length and mass."""
     model, torque = copy.deepcopy(model), mass * length**2
@@ -144,6 +143,7 @@ def test_units_do_not_decide_how_feet_share_the_weight(quadruped):
         np.testing.assert_allclose(u / (mass * length**2), expected, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_linear_model_against_the_c_engine(standing):
     """A and B of a period are the slopes of the balance of forces, cones of its forces."""
     x, u = standing.equilibrium()
