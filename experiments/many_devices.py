@@ -38,7 +38,7 @@ from jaxmpc.batches import Compiled, chosen_devices, over_devices, placement, to
 from jaxmpc.feasible.hull_labels import hull_for
 from jaxmpc.feasible.pipeline import compiled_hull
 from jaxmpc.feasible.problem import FeasibilityProblem
-from jaxmpc.mpc.stagewise.nonlinear import as_argument
+from jaxmpc.systems.given_model import as_argument
 from jaxmpc.tuning.losses import ClosedLoopLoss
 from jaxmpc.tuning.objective import ClosedLoopObjective
 from jaxmpc.tuning.parameters import Parameter, raw

@@ -4,7 +4,8 @@ Problems       LinearSystem, MPC, Box, Polytope, Ellipsoid, Outputs, Soft, softe
                design
 Plans          solve, solve_many, Controller with ADMM and Status; solve_qp of a QP
 Nonlinear      NonlinearMPC, solve_nonlinear
-Closed loops   load_robot, LinearPlant, robot_mpc, RobotController, simulate, simulate_many
+Closed loops   load_robot, LinearPlant, robot_mpc, RobotController, NonlinearController, simulate,
+               simulate_many
 Proofs         map_feasible_set of a grid, feasible_polytope, recursive_feasibility
 Regulators     lqr, maximal_invariant_set
 Tuning         tune_weights with Parameter and ClosedLoopLoss
@@ -40,7 +41,13 @@ if TYPE_CHECKING:
         verify,
         workflow,
     )
-    from jaxmpc.closed_loop import RobotController, robot_mpc, simulate, simulate_many
+    from jaxmpc.closed_loop import (
+        NonlinearController,
+        RobotController,
+        robot_mpc,
+        simulate,
+        simulate_many,
+    )
     from jaxmpc.feasible import feasible_polytope, grid, map_feasible_set
     from jaxmpc.mpc.controller import Controller, solve
     from jaxmpc.mpc.many import solve_many
@@ -74,6 +81,7 @@ __all__ = [
     "Ellipsoid",
     "LinearPlant",
     "LinearSystem",
+    "NonlinearController",
     "NonlinearMPC",
     "Outputs",
     "Parameter",
@@ -117,7 +125,7 @@ __all__ = [
 
 # The module of each name that is no module itself.
 HOMES = {
-    "closed_loop": "RobotController robot_mpc simulate simulate_many",
+    "closed_loop": "NonlinearController RobotController robot_mpc simulate simulate_many",
     "feasible": "feasible_polytope grid map_feasible_set",
     "mpc.controller": "Controller solve",
     "mpc.many": "solve_many",

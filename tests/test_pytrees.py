@@ -43,7 +43,7 @@ def test_no_class_compares_arrays():
     are equal as sets, by their LPs.)"""
     scalars = {int, float, str, bool, int | None, float | None, bool | None}
     words = ("numpy", "Array", "Any", "Reals", "jaxmpc.")
-    own = {"ADMM", "ConstantModel", "Switch"}  # settings, constants
+    own = {"ADMM", "ConstantPart", "Switch"}  # settings, constants
     for c in classes():
         if issubclass(c, ConvexSet):
             continue

@@ -29,7 +29,7 @@ from rivals import RIVALS, Joint, with_torch
 
 import jaxmpc as jm
 from jaxmpc.batches import Compiled
-from jaxmpc.mpc.stagewise.nonlinear import as_argument
+from jaxmpc.systems.given_model import as_argument
 from jaxmpc.tuning.losses import ClosedLoopLoss
 from jaxmpc.tuning.objective import ClosedLoopObjective
 from jaxmpc.tuning.parameters import Parameter, raw

@@ -36,8 +36,8 @@ from searchers import SEARCHERS, Space, search, within
 
 import jaxmpc as jm
 from jaxmpc.batches import Compiled
-from jaxmpc.mpc.stagewise.nonlinear import as_argument
 from jaxmpc.robots.robot import Robot
+from jaxmpc.systems.given_model import as_argument
 from jaxmpc.tuning.losses import ClosedLoopLoss
 from jaxmpc.tuning.objective import ClosedLoopObjective
 from jaxmpc.tuning.parameters import Parameter, raw

@@ -6,6 +6,7 @@ simulate_into              the same of robots into a store, block by block -> St
 summarise_runs             the numbers and the table of many runs -> RunsSummary
 evaluate_runs              limits kept, target reached, settling time and cost -> Outcome
 RobotController            an MPC with the linear models of a robot
+NonlinearController        an MPC with a nonlinear model of any other plant
 GaitController             an MPC of a legged robot along a gait
 robot_mpc                  the MPC of a robot, from the limits of its model
 enclosed_mpc               the robust MPC whose proofs hold for a nonlinear robot
@@ -29,6 +30,7 @@ from jaxmpc.closed_loop.environment import Environment, EnvironmentState, MPCPol
 from jaxmpc.closed_loop.estimation import Belief, Disturbance, KalmanFilter, Noise
 from jaxmpc.closed_loop.feedback import LinearFeedback, NoPlan
 from jaxmpc.closed_loop.gait_controller import GaitController
+from jaxmpc.closed_loop.nonlinear_controller import NonlinearController
 from jaxmpc.closed_loop.nonlinear_proofs import enclosed_mpc
 from jaxmpc.closed_loop.offset_free import OffsetFreeController, augmented
 from jaxmpc.closed_loop.outcome import Outcome, RunsSummary, evaluate_runs, summarise_runs
@@ -49,6 +51,7 @@ __all__ = [
     "MPCPolicy",
     "NoPlan",
     "Noise",
+    "NonlinearController",
     "OffsetFreeController",
     "Outcome",
     "RobotController",

@@ -19,6 +19,7 @@ from jaxmpc.checks import (
     require_shape,
     require_symmetric_psd,
 )
+from jaxmpc.mpc.stagewise.nonlinear import NonlinearMPC, linear_model
 from jaxmpc.pytrees import named_pytree, pytree, static
 from jaxmpc.qp.linalg import arrays, eigh, matmul, solve, symmetric
 from jaxmpc.robots.linear_plant import LinearPlant
@@ -171,9 +172,9 @@ class Belief(NamedTuple):
 class KalmanFilter:
     """Kalman filter of a model ξ⁺ = f(ξ, u) + w with outputs y = C ξ + v, w and v white.
 
-    model: a LinearSystem or LinearPlant, or a Robot, of which the predictor is the model: its own
-        next state is the prediction, its linear model about the estimate moves the covariance
-        (extended Kalman filter).
+    model: a LinearSystem or LinearPlant; or a Robot, of which the predictor is the model, or a
+        NonlinearMPC with its model: their next state is the prediction, their linear model about
+        the estimate moves the covariance (extended Kalman filter).
     process: of w, measurement: of v; standard deviations, a number or one an entry, or covariances,
         as in `Noise`. That of v must be positive definite.
     C (p, n): outputs; None: the positions, the first half of the coordinates.
@@ -202,7 +203,8 @@ class KalmanFilter:
         """Return the filter with its constant gain, if it has one; raise ValueError where data do
         not fit together, or where no steady state exists (outside traces; there the gain is NaN).
         """
-        require_kind("observer.model", self.model, LinearSystem, LinearPlant, Robot)
+        kinds = LinearSystem, LinearPlant, Robot, NonlinearMPC
+        require_kind("observer.model", self.model, *kinds)
         if not isinstance(self.model, Robot):
             self.model.validate()
         n = self.model.n
@@ -228,9 +230,9 @@ class KalmanFilter:
         given["disturbance"] = self._prepared_disturbances(p)
         if self.initial is not None or self.gain is not None:
             return replace(self, **given)
-        if isinstance(self.model, Robot):
+        if isinstance(self.model, Robot | NonlinearMPC):
             cure = "Give standard deviations, or use the LinearSystem of the set-point as the model"
-            fail("observer.initial", "is None for a Robot", cure)
+            fail("observer.initial", f"is None for a {type(self.model).__name__}", cure)
         made = replace(self, **given)
         system = made.linear_model
         if made.disturbance and concrete(system, made.C, made.disturbance):
@@ -394,10 +396,8 @@ class KalmanFilter:
         after = jnp.concatenate([after, d])
         if P is None:
             return Belief(after, None)
-        model = self.model
-        if not isinstance(model, LinearSystem):
-            model = model.linearize(model.state(xi), u)
-        A, _ = self._with_disturbances(jnp.asarray(model.A, d.dtype), jnp.asarray(model.B, d.dtype))
+        A, B = (jnp.asarray(v, d.dtype) for v in _slopes(self.model, xi, u))
+        A, _ = self._with_disturbances(A, B)
         W = jnp.asarray(self._covariance("process"), d.dtype)
         return Belief(after, matmul(A, matmul(P, A.T)) + W)
 
@@ -469,4 +469,13 @@ def model_step(model: Any, xi: Array, u: Array) -> Array:
     """Return the coordinates (n,) one time step later by a model: of a Robot, its predictor."""
     if isinstance(model, Robot):
         return RobotModel(model).step(xi, u)
-    return model.step(xi, u)
+    return (model.model if isinstance(model, NonlinearMPC) else model).step(xi, u)
+
+
+def _slopes(model: Any, xi: Array, u: Array) -> tuple[Any, Any]:
+    """Return A (n, n), B (n, m) of a model about ξ, u."""
+    if isinstance(model, NonlinearMPC):
+        return linear_model(model.model, xi, u)[:2]
+    if not isinstance(model, LinearSystem):
+        model = model.linearize(model.state(xi), u)
+    return model.A, model.B

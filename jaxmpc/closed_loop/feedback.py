@@ -29,7 +29,8 @@ class Plant(Protocol):
 
 
 class Feedback(Protocol):
-    """A controller: `jm.Controller`, `RobotController`, `LinearFeedback`, or another such object.
+    """A controller: `jm.Controller`, `RobotController`, `NonlinearController`, `LinearFeedback`, or
+    another such object.
 
     mpc: whose horizon and weights evaluate the loop. dtype: the precision of the inputs.
     state_size: the length of the plant's state. limits: by which the plant's states are evaluated.
@@ -65,9 +66,10 @@ class Feedback(Protocol):
 
 
 def model_of(controller: Feedback) -> Any:
-    """Return the model that a controller has of its plant: a Robot, LinearPlant or LinearSystem."""
-    robot = getattr(controller, "robot", getattr(controller, "plant", None))
-    return controller.mpc.system if robot is None else robot
+    """Return the model that a controller has of its plant: a Robot, the model of a
+    NonlinearController, a LinearPlant or LinearSystem."""
+    own = (getattr(controller, name, None) for name in ("robot", "plant", "model"))
+    return next((model for model in own if model is not None), controller.mpc.system)
 
 
 def one_state(controller: Feedback, x: Reals) -> Array:

@@ -4,8 +4,7 @@ by linear models."""
 import warnings
 from collections.abc import Iterator
 from dataclasses import field, replace
-from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -14,14 +13,19 @@ from jax import Array
 
 from jaxmpc.arrays import Reals, as_weight, host_array
 from jaxmpc.checks import concrete, fail, whole
-from jaxmpc.closed_loop.feedback import first_row, one_state
-from jaxmpc.mpc.controller import Controller, zeros_of
-from jaxmpc.mpc.plan import Control, Plan, WarmStart, anchored, applied, limited, require_before
+from jaxmpc.closed_loop.feedback import one_state
+from jaxmpc.closed_loop.nonlinear_controller import (
+    NonlinearController,
+    at_rest,
+    last_input,
+    resting_start,
+)
+from jaxmpc.mpc.controller import Controller
+from jaxmpc.mpc.plan import Control, Plan, applied, limited, require_before
 from jaxmpc.mpc.problem import MPC, Outputs, Soft, as_tuple, soften
 from jaxmpc.mpc.rows import layout
-from jaxmpc.mpc.stagewise.nonlinear import NonlinearMPC, Task, task_layout
+from jaxmpc.mpc.stagewise.nonlinear import NonlinearMPC, Task
 from jaxmpc.mpc.stagewise.solve import factor_stages, solve_stagewise
-from jaxmpc.mpc.stagewise.sqp import solve_nonlinear
 from jaxmpc.pytrees import prepared_pytree, static
 from jaxmpc.qp.admm import ADMM, DEFAULT
 from jaxmpc.qp.linalg import arrays, floating_dtype
@@ -270,7 +274,7 @@ class RobotController:
     rho: Any
     tasks: tuple[Task, ...]
     sqp_steps: int = static()
-    hessian: str = static()
+    hessian: Literal["exact", "gauss-newton"] = static()
     soft: Any = field(init=False)
     fixed: Controller | None = field(init=False)
     scale: Any = field(init=False)
@@ -285,7 +289,7 @@ class RobotController:
         rho: Reals = 1e4,
         tasks: tuple[Task, ...] = (),
         sqp_steps: int = 1,
-        hessian: str = "gauss-newton",
+        hessian: Literal["exact", "gauss-newton"] = "gauss-newton",
     ) -> None:
         solver = DEFAULT if solver is None else solver
         if solver.iterations is None and linearize != "set-point":
@@ -335,17 +339,7 @@ class RobotController:
     def start(self, x: Array, input_reference: Any = None) -> Control[Plan]:
         """Return what stands for the time step before the first: at rest at x under the first input
         of input_reference, zero for none."""
-        zeros = zeros_of(partial(self, input_reference=input_reference), x)
-        states, inputs = self._resting(x, input_reference)
-        assert zeros.memory is not None
-        memory = zeros.memory._replace(states=states, inputs=inputs)
-        return zeros._replace(u=inputs[0], memory=memory)
-
-    def _resting(self, x: Array, input_reference: Any) -> tuple[Array, Array]:
-        """Return states (N+1, n) that stay at x and inputs (N, m), the first of input_reference."""
-        xi, N, m = self.coordinates(x), self.soft.horizon, self.robot.m
-        u = first_row(np.zeros(m) if input_reference is None else input_reference, xi.dtype)
-        return jnp.broadcast_to(xi, (N + 1, len(xi))), jnp.broadcast_to(u, (N, m))
+        return resting_start(self, x, input_reference)
 
     def __call__(
         self,
@@ -363,59 +357,40 @@ class RobotController:
         """
         x = one_state(self, x)
         require_before(before)
+        known: dict[str, Any] = {
+            "input_reference": input_reference,
+            "previous_input": previous_input,
+        }
+        xi = self.coordinates(x)
         if self.fixed is not None:
-            known = {"input_reference": input_reference, "previous_input": previous_input}
-            known["forecast"] = forecast
-            return self.fixed(self.coordinates(x), before, reference, **known)
+            return self.fixed(xi, before, reference, **known, forecast=forecast)
         if forecast is not None:
             what = f"given with linearize={self.linearize!r}"
             fail("forecast", what, 'Give linearize="set-point", or leave it out')
-        problem = self.problem
-        rows = layout(self.soft) + task_layout(problem)
-        memory = None if before is None else before.memory
-        last = previous_input if previous_input is not None or before is None else before.u
-        if last is not None:
-            last = jnp.asarray(last)
-            last = limited(self.soft.inputs, jnp.where(jnp.isfinite(last), last, 0.0))
-        start = None if memory is None else memory.shifted(rows, memory.inputs[-1])
-        given: dict[str, Any] = {"input_reference": input_reference, "previous_input": last}
-        given["scale"] = self.scale
-        xi = self.coordinates(x)
         if self.linearize == "trajectory":
-            if start is None:
-                blank = jnp.zeros(sum(len(steps) * size for _, steps, size in rows), xi.dtype)
-                start = WarmStart(*self._resting(x, input_reference), blank)
-            start = anchored(start, xi)
-            reference, targets = self._targets(problem, reference)
-            given |= {"iterations": self.sqp_steps, "hessian": self.hessian}
-            given["targets"] = targets
-            plan = solve_nonlinear(problem, xi, reference, self.solver, start, **given)
-        else:
-            inputs = self._resting(x, input_reference)[1] if memory is None else memory.inputs
-            system = self.robot.linearize(x, limited(self.soft.inputs, inputs[0]), exact=self.exact)
-            mpc = replace(self.soft, system=system)
-            plan = solve_stagewise(mpc, xi, reference, self.solver, start, **given)
+            return self.nonlinear(xi, before, reference, **known)
+        memory = None if before is None else before.memory
+        last = last_input(self.soft, before, previous_input)
+        rows = layout(self.soft)
+        start = None if memory is None else memory.shifted(rows, memory.inputs[-1])
+        inputs = at_rest(self, x, input_reference)[1] if memory is None else memory.inputs
+        system = self.robot.linearize(x, limited(self.soft.inputs, inputs[0]), exact=self.exact)
+        known |= {"previous_input": last, "scale": self.scale}
+        mpc = replace(self.soft, system=system)
+        plan = solve_stagewise(mpc, xi, reference, self.solver, start, **known)
         return applied(self.soft, rows, plan, memory, last)
 
     @property
-    def problem(self) -> NonlinearMPC:
-        """Return the nonlinear problem of "trajectory"."""
-        return NonlinearMPC(self.soft, as_model(self.robot, self.exact), self.tasks)
+    def nonlinear(self) -> NonlinearController:
+        """Return the controller of "trajectory", in the coordinates."""
+        problem = NonlinearMPC(self.soft, as_model(self.robot, self.exact), self.tasks)
+        steps, hessian = self.sqp_steps, self.hessian
+        return NonlinearController(problem, self.solver, steps, hessian, self.scale)
 
     @property
     def reference_sizes(self) -> tuple[int, ...]:
         """Return how many columns `reference` may have: n, or those and the tasks' targets."""
-        n = self.mpc.system.n
-        return (n, n + self.problem.targets) if self.tasks else (n,)
-
-    def _targets(self, problem: NonlinearMPC, reference: Any) -> tuple[Any, Any]:
-        """Return the reference of the coordinates and those of the tasks, None for their own."""
-        n = self.mpc.system.n
-        if reference is None or np.shape(reference)[-1] == n:
-            return reference, None
-        ends = n + np.cumsum(problem.sizes())[:-1]
-        reference, *targets = jnp.split(reference, [n, *ends], axis=-1)
-        return reference, targets
+        return self.nonlinear.reference_sizes if self.tasks else (self.mpc.system.n,)
 
 
 def as_model(robot: Any, exact: bool = True) -> Any:

@@ -33,12 +33,12 @@ from jaxmpc.closed_loop.estimation import Belief, KalmanFilter, Noise, model_ste
 from jaxmpc.closed_loop.feedback import Feedback, LinearFeedback, Plant, first_row, model_of
 from jaxmpc.mpc.plan import Control, checked_aim, checked_array, reference_shapes
 from jaxmpc.mpc.problem import weights_of
-from jaxmpc.mpc.stagewise.nonlinear import ConstantModel, as_argument
 from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.jax_transformations import own_modes, varying
 from jaxmpc.qp.linalg import arrays, matmul
 from jaxmpc.qp.status import Status
 from jaxmpc.sets.limits import worst_violation
+from jaxmpc.systems.given_model import as_argument, is_model
 from jaxmpc.systems.system import LinearSystem
 
 
@@ -129,10 +129,12 @@ def simulate(
 ) -> Run:
     """Simulate `plant` under `controller` from the state x0 (n,) for T = steps time steps.
 
-    controller: a Controller, RobotController, OffsetFreeController or LinearFeedback.
-    plant: a LinearSystem, LinearPlant or Robot, or any object with `step(x, u) -> x` written in
-        JAX; the controller's own `mpc.system` gives the nominal loop. A plant that is a pytree is
-        an argument of the compiled program, any other object a constant of it.
+    controller: a Controller, RobotController, NonlinearController, OffsetFreeController or
+        LinearFeedback.
+    plant: a LinearSystem, LinearPlant or Robot, or any function (x, u) -> x⁺ or object with such a
+        `step`, written in JAX; the controller's own `mpc.system`, or `model` of a
+        NonlinearController, gives the nominal loop. The arrays of a pytree are arguments of the
+        compiled program, any other object is a constant of it.
     reference: state to track in the coordinates of the controller, (n,), or (T + N, n): the plan at
         step t sees the rows t … t+N. None: their origin, also where a robot's problem was made
         about another target.
@@ -194,7 +196,8 @@ def checked_loop(
         controller.validate()
     if not hasattr(controller, "mpc"):
         what = f"is a {type(controller).__name__}"
-        fail("controller", what, "Give a Controller, RobotController or LinearFeedback")
+        cure = "Give a Controller, RobotController, NonlinearController or LinearFeedback"
+        fail("controller", what, cure)
     n, size = controller.mpc.system.n, controller.state_size
     whole("steps", steps, 1)
     aim = checked_aim(
@@ -255,13 +258,14 @@ def checked_loop(
         observer=observer,
         delay=int(given.delay),
     )
-    return as_argument(plant), aim.x0, given
+    return plant, aim.x0, given
 
 
 def _checked_plant(plant: Any, n: int, m: int) -> Any:
-    """Return the plant, its leaves as arrays; raise ValueError unless it has `step` and fits."""
-    if not callable(getattr(plant, "step", None)):
-        fail("plant", f"is a {type(plant).__name__}", "Give a LinearSystem, or step(x, u) -> x")
+    """Return the plant as an argument of a program; raise ValueError unless it is one and fits."""
+    if not is_model(plant) or hasattr(plant, "mpc"):
+        cure = "Give a LinearSystem, a Robot, or a function (x, u) -> x"
+        fail("plant", f"is a {type(plant).__name__}", cure)
     if isinstance(plant, LinearSystem):
         plant.validate()
     sizes = getattr(plant, "state_size", n), getattr(plant, "m", m)
@@ -269,7 +273,7 @@ def _checked_plant(plant: Any, n: int, m: int) -> Any:
         what = f"has {sizes[0]} states and {sizes[1]} inputs, the controller {n} and {m}"
         cure = "Give them in its coordinates (a RobotController knows those of its robot)"
         fail("plant", what, cure)
-    return plant if jax.tree_util.all_leaves([plant]) else arrays(plant)
+    return arrays(as_argument(plant))
 
 
 # What goes from one time step to the next: the state, what the controller gave at the step before,
@@ -286,7 +290,7 @@ class Loop:
         self.controller, self.given = controller, given
         own = getattr(controller, "observer", None)
         self.observer: KalmanFilter | None = given.observer if own is None else own
-        self.plant = plant = plant.given if isinstance(plant, ConstantModel) else plant
+        self.plant = plant
         self.horizon = controller.mpc.horizon
         weights = weights_of(replace(controller.mpc, stage_weights=None), dtype)
         # Where they differ from step to step a time step costs what the first of a plan does.
@@ -571,7 +575,7 @@ def require_variations(plant: Any, variations: Mapping[str, Any], count: int) ->
 
 def simulate_each(
     controller: Feedback,
-    plant: Plant,
+    plant: Any,
     shared: Conditions,
     each: Each,
     *,
@@ -583,13 +587,12 @@ def simulate_each(
 
     plant: from `as_argument`; each loop has it with its own variations.
     """
-    bare: Any = plant.given if isinstance(plant, ConstantModel) else plant
 
     def loop(one: Each) -> Run:
         given = replace(shared, **one.references)
         if shared.noise is not None:
             given = replace(given, noise=shared.noise.of_loop(one.numbers))
-        varied = bare.vary(**one.variations) if one.variations else bare
+        varied = plant.vary(**one.variations) if one.variations else plant
         return simulate(controller, varied, one.x0s, steps, checkpoint=checkpoint, **vars(given))
 
     return jax.vmap(loop)(each)

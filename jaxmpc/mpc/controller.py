@@ -109,7 +109,7 @@ class Controller:
     factor: Factor = field(init=False)
 
     def __post_init__(self) -> None:
-        require_kind("mpc", self.mpc, MPC)
+        require_linear(self.mpc, "jm.NonlinearController")
         self.mpc.validate()
         require_kind("solver", self.solver, ADMM)
         self.solver.validate()
@@ -235,6 +235,12 @@ class Controller:
         """Sort the QP's multipliers y (rows,) by constraint and step."""
         c = self.condensed
         return sorted_multipliers(self.mpc, c.layout, y)
+
+
+def require_linear(mpc: Any, other: str) -> None:
+    """Raise ValueError unless this is an MPC; other: what takes one with a nonlinear model."""
+    nonlinear = isinstance(getattr(mpc, "mpc", None), MPC) and hasattr(mpc, "tasks")
+    require_kind("mpc", mpc, MPC, cure=f"Give it to {other}" if nonlinear else "")
 
 
 def _look_at_size(mpc: MPC, rows: int, variables: int) -> None:
@@ -583,7 +589,7 @@ def solve(
     once. Raises ValueError for an ill-posed problem or wrong shapes, before any compile; what
     depends on values inside a batch is answered by `plan.status`.
     """
-    require_kind("mpc", mpc, MPC)
+    require_linear(mpc, "jm.solve_nonlinear")
     mpc.require_sizes()
     aim = x0, reference, input_reference, previous_input, forecast
     checked_aim(mpc, *aim)

@@ -15,8 +15,8 @@ from jaxmpc.batches import chosen_devices
 from jaxmpc.checks import fail, nearest, whole
 from jaxmpc.closed_loop.simulation import Conditions, Run, initial_states, require_variations
 from jaxmpc.mpc.problem import MPC, harden
-from jaxmpc.mpc.stagewise.nonlinear import as_argument
 from jaxmpc.qp.admm import ADMM
+from jaxmpc.systems.given_model import as_argument
 from jaxmpc.tuning.descent import Settings, descend
 from jaxmpc.tuning.losses import ClosedLoopLoss, SeveralLosses
 from jaxmpc.tuning.objective import (

@@ -14,7 +14,7 @@ Newton's, stage by stage: with the costates λ and the multipliers y of the func
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
@@ -34,9 +34,10 @@ from jaxmpc.mpc.plan import Aim
 from jaxmpc.mpc.problem import MPC, dynamics_of
 from jaxmpc.mpc.rows import Rows, at, joined_bounds, spread
 from jaxmpc.mpc.stagewise.stages import Stages, remembering
-from jaxmpc.pytrees import named_pytree, pytree, static, static_pytree
+from jaxmpc.pytrees import named_pytree, pytree, static
 from jaxmpc.qp.linalg import apply, apply_transposed, matmul, symmetric
 from jaxmpc.qp.problem import Bounds
+from jaxmpc.systems.given_model import as_argument, is_model
 from jaxmpc.systems.system import LinearSystem
 
 
@@ -126,32 +127,6 @@ class Point(NamedTuple):
     u: Array
 
 
-@static_pytree
-@dataclass(frozen=True, eq=False)
-class ConstantModel:
-    """A model or plant that is no pytree: a constant of compiled programs, compared by identity.
-
-    given: a function (x, u) -> x⁺, or an object with such a `step`.
-    """
-
-    given: Any
-
-    def step(self, x: Array, u: Array) -> Array:
-        """Return x⁺."""
-        return getattr(self.given, "step", self.given)(x, u)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, ConstantModel) and self.given is other.given
-
-    def __hash__(self) -> int:
-        return id(self.given)
-
-
-def as_argument(model: Any) -> Any:
-    """Return a model or plant as an argument of a program: itself where it is a pytree."""
-    return ConstantModel(model) if jax.tree_util.all_leaves([model]) else model
-
-
 @pytree
 class NonlinearMPC:
     """The problem of `MPC` with a nonlinear model, and with costs and limits on functions:
@@ -165,8 +140,8 @@ class NonlinearMPC:
         horizons.
     model: f, a function (x, u) -> x⁺ written in JAX, or an object with such a `step`, and, if it
         has them, `linearize(x, u)` -> LinearSystem and `view(x, u)`, of which tasks are functions.
-        A pytree is data of the program (derivatives with respect to its leaves), any other object
-        a constant of it.
+        The arrays of a pytree, such as an equinox module, are data of the program (derivatives with
+        respect to them), any other object is a constant of it.
     tasks: `Task`s.
     """
 
@@ -175,8 +150,18 @@ class NonlinearMPC:
     tasks: tuple[Task, ...] = ()
 
     def __post_init__(self) -> None:
-        if isinstance(self.mpc, MPC) and callable(getattr(self.model, "step", self.model)):
+        if isinstance(self.mpc, MPC) and is_model(self.model):
             object.__setattr__(self, "model", as_argument(self.model))
+
+    @property
+    def n(self) -> int:
+        """Return the number of states."""
+        return self.mpc.system.n
+
+    @property
+    def m(self) -> int:
+        """Return the number of inputs."""
+        return self.mpc.system.m
 
     @property
     def targets(self) -> int:
@@ -200,7 +185,7 @@ class NonlinearMPC:
             what = "given beside a nonlinear model, for which the tightened rows prove nothing"
             fail("mpc.disturbance", what, "Leave it out, or use jm.solve with a linear model")
         self.mpc.require_unique_inputs()
-        if not callable(getattr(self.model, "step", None)):
+        if not is_model(self.model):
             fail("model", f"is a {type(self.model).__name__}", "Give f(x, u) -> x⁺, or its object")
         if not isinstance(self.tasks, tuple) or not all(isinstance(t, Task) for t in self.tasks):
             fail("tasks", f"is a {type(self.tasks).__name__}", "Give a tuple of jm.mpc.Task")

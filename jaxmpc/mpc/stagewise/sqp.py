@@ -121,16 +121,8 @@ def solve_nonlinear(
     elsewhere. Raises ValueError for wrong shapes, and for what `solve_stagewise` does not support.
     """
     require_kind("problem", problem, NonlinearMPC)
-    problem.validate()
+    solver = checked_search(problem, solver, iterations, hessian)
     mpc = problem.mpc
-    whole("iterations", iterations, 1)
-    if solver.iterations is None:
-        solver = replace(solver, iterations=0)
-    checked(mpc, replace(solver, rho=None))
-    if hessian not in ("exact", "gauss-newton"):
-        fail("hessian", f"{hessian!r}", 'Give "exact" or "gauss-newton"')
-    if solver.differentiate != "implicit" and iterations > 1:
-        fail("solver.differentiate", f"{solver.differentiate!r}", 'With iterations > 1: "implicit"')
     s = jax.eval_shape(Stages.of, mpc)
     aim = checked_aim(mpc, x0, reference, input_reference, previous_input)
     aim = full_aim(mpc, aim, s.P.dtype)
@@ -146,6 +138,27 @@ def solve_nonlinear(
     # About a plan the multipliers are known, of which the exact Hessian is made.
     known = warm_start is not None
     return _solve(*given, iterations=int(iterations), hessian=hessian, known=known)
+
+
+def checked_search(
+    problem: NonlinearMPC,
+    solver: ADMM,
+    steps: int,
+    hessian: str,
+    name: str = "iterations",
+) -> ADMM:
+    """Return the solver of the QPs, without ADMM steps unless it says how many; ValueError for what
+    is wrong with the arguments of `solve_nonlinear`. name: of the number of QPs."""
+    problem.validate()
+    whole(name, steps, 1)
+    if solver.iterations is None:
+        solver = replace(solver, iterations=0)
+    checked(problem.mpc, replace(solver, rho=None))
+    if hessian not in ("exact", "gauss-newton"):
+        fail("hessian", f"{hessian!r}", 'Give "exact" or "gauss-newton"')
+    if solver.differentiate != "implicit" and steps > 1:
+        fail("solver.differentiate", f"{solver.differentiate!r}", f'With {name} > 1: "implicit"')
+    return solver
 
 
 def _full_targets(

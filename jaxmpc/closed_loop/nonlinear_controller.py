@@ -1,0 +1,195 @@
+"""NonlinearController: a nonlinear MPC problem as a feedback policy, by one or more QPs a step."""
+
+from dataclasses import replace
+from functools import partial
+from typing import Any, Literal
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxmpc.arrays import Reals
+from jaxmpc.checks import require_kind
+from jaxmpc.closed_loop.feedback import Feedback, first_row, one_state
+from jaxmpc.mpc.controller import zeros_of
+from jaxmpc.mpc.plan import (
+    Control,
+    Plan,
+    WarmStart,
+    anchored,
+    applied,
+    checked_array,
+    limited,
+    require_before,
+)
+from jaxmpc.mpc.problem import MPC, at_stage
+from jaxmpc.mpc.rows import layout, row_count
+from jaxmpc.mpc.stagewise.nonlinear import NonlinearMPC, task_layout
+from jaxmpc.mpc.stagewise.sqp import checked_search, solve_nonlinear
+from jaxmpc.pytrees import prepared_pytree, static
+from jaxmpc.qp.admm import ADMM, DEFAULT
+from jaxmpc.qp.linalg import floating_dtype
+
+
+@prepared_pytree
+class NonlinearController:
+    """A nonlinear MPC problem as a feedback policy, for `simulate` and `tune_weights`.
+
+    `controller(x, before) -> Control`, as `Controller`: its u (m,) is the first input of the plan
+    that `solve_nonlinear` finds from x (n,), warm-started by the plan of `before`, shifted by one
+    step; at the start by rest at x under the first input_reference. When the plan is not SOLVED, u
+    is the first input of where the search ended: look at plan.solved. Limits are hard where the
+    problem says so; `jm.soften(mpc, rho)` gives one whose state limits give way.
+
+    problem: `NonlinearMPC`, whose model predicts: `problem.model` as the plant of `simulate` gives
+      the nominal loop.
+    solver: of the QPs, as in `solve_nonlinear`; its eps is the tolerance of the plan.
+    sqp_steps: QPs a time step at most. 1: the real-time iteration, whose status is that of one QP
+      about the last plan, not of the nonlinear problem.
+    hessian: as in `solve_nonlinear`.
+    scale (rows,): row scale of a similar problem, as in `solve_stagewise`; None: of each QP its
+      own.
+
+    References are as in `solve_nonlinear`; behind its n columns `reference` may have the targets of
+    the tasks, one after the other. A pytree: the arrays of problem and model may be traced. Raises
+    ValueError as `solve_nonlinear` does.
+    """
+
+    problem: NonlinearMPC
+    solver: ADMM = DEFAULT
+    sqp_steps: int = static(default=10)
+    hessian: Literal["exact", "gauss-newton"] = static(default="exact")
+    scale: Any = None
+
+    def __post_init__(self) -> None:
+        require_kind("problem", self.problem, NonlinearMPC)
+        require_kind("solver", self.solver, ADMM)
+        solver = checked_search(
+            self.problem, self.solver, self.sqp_steps, self.hessian, "sqp_steps"
+        )
+        object.__setattr__(self, "solver", solver)
+
+    def __repr__(self) -> str:
+        """Return the size of the problem and the QPs a step, in one line."""
+        mpc, tasks = self.mpc, len(self.problem.tasks)
+        with_tasks = f", {tasks} task{'s' * (tasks > 1)}" if tasks else ""
+        sizes = f"{mpc.system.n} states, {mpc.system.m} inputs, horizon {mpc.horizon}{with_tasks}"
+        steps = f"at most {self.sqp_steps} SQP steps" if self.sqp_steps > 1 else "one QP"
+        return f"NonlinearController({sizes}, {steps} a sample)"
+
+    @property
+    def mpc(self) -> MPC:
+        """Return the problem's weights, limits and horizon."""
+        return self.problem.mpc
+
+    @property
+    def model(self) -> Any:
+        """Return the model that predicts."""
+        return self.problem.model
+
+    @property
+    def dtype(self) -> Any:
+        """Return the precision of the plans."""
+        mpc: Any = self.mpc
+        return floating_dtype(replace(mpc, system=None))
+
+    @property
+    def state_size(self) -> int:
+        """Return the length n of the state."""
+        return self.mpc.system.n
+
+    @property
+    def limits(self) -> Any:
+        """Return the set by which violations of a closed loop are measured; of limits that differ
+        from stage to stage those of the first."""
+        return at_stage(self.mpc.states, 0)
+
+    @property
+    def reference_sizes(self) -> tuple[int, ...]:
+        """Return how many columns `reference` may have: n, or those and the tasks' targets."""
+        n = self.state_size
+        return (n, n + self.problem.targets) if self.problem.tasks else (n,)
+
+    def coordinates(self, x: Array) -> Array:
+        """Return the state in which the problem is written: x itself."""
+        return x
+
+    def start(self, x: Array, input_reference: Any = None) -> Control[Plan]:
+        """Return what stands for the time step before the first: at rest at x under the first input
+        of input_reference, zero for none."""
+        return resting_start(self, x, input_reference)
+
+    def __call__(
+        self,
+        x: Reals,
+        before: Control[Plan] | None = None,
+        reference: Reals | None = None,
+        *,
+        input_reference: Reals | None = None,
+        previous_input: Reals | None = None,
+    ) -> Control[Plan]:
+        """Return the input (m,) at the state x (n,), its plan, and what to remember.
+
+        before: None, or what was returned at the time step before, of which also the input counts
+        where its rate is limited or weighed and previous_input is None.
+        """
+        x = one_state(self, x)
+        require_before(before)
+        problem, rows = self.problem, layout(self.mpc) + task_layout(self.problem)
+        memory = None if before is None else before.memory
+        last = last_input(self.mpc, before, previous_input)
+        if memory is None:
+            start = WarmStart(
+                *at_rest(self, x, input_reference), jnp.zeros(row_count(rows), x.dtype)
+            )
+        else:
+            start = memory.shifted(rows, memory.inputs[-1])
+        reference, targets = self._targets(reference)
+        plan = solve_nonlinear(
+            problem, x, reference, self.solver, anchored(start, x),
+            input_reference=input_reference, previous_input=last, targets=targets,
+            iterations=self.sqp_steps, hessian=self.hessian, scale=self.scale,
+        )  # fmt: skip
+        return applied(self.mpc, rows, plan, memory, last)
+
+    def _targets(self, reference: Any) -> tuple[Any, Any]:
+        """Return the reference of the states and those of the tasks, None for their own."""
+        N, n = self.mpc.horizon, self.state_size
+        if reference is None:
+            return None, None
+        shapes = [shape for size in self.reference_sizes for shape in ((size,), (N + 1, size))]
+        reference = checked_array("reference", reference, shapes)
+        if np.shape(reference)[-1] == n:
+            return reference, None
+        ends = n + np.cumsum(self.problem.sizes())[:-1]
+        reference, *targets = jnp.split(jnp.asarray(reference), [n, *ends], axis=-1)
+        return reference, targets
+
+
+def resting_start(controller: Feedback, x: Array, input_reference: Any) -> Control[Plan]:
+    """Return what stands for the time step before the first of a controller whose plans are about
+    a trajectory: at rest at x under the first input of input_reference, zero for none."""
+    zeros = zeros_of(partial(controller, input_reference=input_reference), x)
+    states, inputs = at_rest(controller, x, input_reference)
+    assert zeros.memory is not None
+    memory = zeros.memory._replace(states=states, inputs=inputs)
+    return zeros._replace(u=inputs[0], memory=memory)
+
+
+def at_rest(controller: Feedback, x: Array, input_reference: Any) -> tuple[Array, Array]:
+    """Return states (N+1, n) that stay at x and inputs (N, m), the first of input_reference."""
+    mpc, xi = controller.mpc, controller.coordinates(x)
+    u = first_row(np.zeros(mpc.system.m) if input_reference is None else input_reference, xi.dtype)
+    states = jnp.broadcast_to(xi, (mpc.horizon + 1, len(xi)))
+    return states, jnp.broadcast_to(u, (mpc.horizon, mpc.system.m))
+
+
+def last_input(mpc: MPC, before: Control[Plan] | None, previous_input: Any) -> Array | None:
+    """Return the input (m,) before a time step, within the limits: the given one, or that of
+    `before`; None where neither is known."""
+    if previous_input is None:
+        if before is None:
+            return None
+        previous_input = before.u
+    u = jnp.asarray(previous_input)
+    return limited(mpc.inputs, jnp.where(jnp.isfinite(u), u, 0.0))

@@ -1,0 +1,92 @@
+"""Models and plants that users write, as arguments of compiled programs."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import numpy as np
+from jax import Array
+
+from jaxmpc.pytrees import pytree, static_pytree
+
+
+class Number:
+    """Stands in a `ConstantPart` where the model has an array."""
+
+
+@static_pytree
+@dataclass(frozen=True, eq=False)
+class ConstantPart:
+    """A model with `Number` in place of its arrays: a constant of programs. Two are equal where
+    they have the same structure, and functions and other objects in it are the same."""
+
+    given: Any
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, ConstantPart):
+            return False
+        mine, theirs = jax.tree.leaves(self.given), jax.tree.leaves(other.given)
+        tree: Any = jax.tree.structure(self.given)
+        return tree == jax.tree.structure(other.given) and all(map(_same, mine, theirs))
+
+    def __hash__(self) -> int:
+        leaves, tree = jax.tree.flatten(self.given)
+        return hash((tree, *(v if isinstance(v, int | str) else id(v) for v in leaves)))
+
+
+def _same(a: Any, b: Any) -> bool:
+    return a is b or (type(a) is type(b) and isinstance(a, int | str) and a == b)
+
+
+@pytree
+class GivenModel:
+    """A function (x, u) -> x⁺, or an object with such a `step`, as an argument of programs.
+
+    Of a pytree, such as an equinox module, arrays and floating-point numbers are data, with respect
+    to which there are derivatives; its functions and whole numbers are constants, as any other
+    object is. Other attributes are those of the object.
+    """
+
+    numbers: tuple
+    constant: ConstantPart
+
+    @property
+    def given(self) -> Any:
+        """The function or object."""
+        leaves, tree = jax.tree.flatten(self.constant.given)
+        numbers = iter(self.numbers)
+        return jax.tree.unflatten(
+            tree, [next(numbers) if leaf is Number else leaf for leaf in leaves]
+        )
+
+    def step(self, x: Array, u: Array) -> Array:
+        """Return x⁺."""
+        given = self.given
+        return getattr(given, "step", given)(x, u)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_") or name in ("numbers", "constant"):
+            raise AttributeError(name)
+        return getattr(self.given, name)
+
+
+def is_model(model: Any) -> bool:
+    """Return whether this is a function, or an object with `step`; no class of such objects."""
+    return callable(getattr(model, "step", model)) and not isinstance(model, type)
+
+
+def as_argument(model: Any) -> Any:
+    """Return a model or plant as an argument of a program: itself where it is a pytree of arrays
+    with a method `step`."""
+    leaves, tree = jax.tree.flatten(model)
+    alone = jax.tree_util.all_leaves([model])
+    if (
+        hasattr(model, "step")
+        and not alone
+        and not any(callable(v) or isinstance(v, str) for v in leaves)
+    ):
+        return model
+    is_number = [isinstance(v, jax.Array | np.ndarray | np.inexact | float) for v in leaves]
+    numbers = tuple(v for v, has in zip(leaves, is_number, strict=True) if has)
+    rest = [Number if has else v for v, has in zip(leaves, is_number, strict=True)]
+    return GivenModel(numbers, ConstantPart(jax.tree.unflatten(tree, rest)))
