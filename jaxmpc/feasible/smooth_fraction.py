@@ -27,7 +27,7 @@ from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp import linalg
 from jaxmpc.qp.jax_transformations import own_modes, varying
 from jaxmpc.qp.linalg import arrays, matmul
-from jaxmpc.qp.newton import Augmented, Constants, newton_step, ridged
+from jaxmpc.qp.newton import Augmented, Constants, gram, newton_step, ridged
 from jaxmpc.qp.problem import Bounds
 
 # Newton steps at most: most states need 3 to 20.
@@ -113,7 +113,8 @@ def _membership(c: Condensed, x0s: Array, width: Array, scale: Any, steps: int) 
     normal = ridged(matmul(centred.T, centred), 1.0)
 
     def one(x0: Array) -> Array:
-        # The minimiser, and which states have one that numbers can hold: constants here.
+        # The minimiser, and which states have one that numbers can hold. Of the distance the first
+        # derivative takes it for a constant; the second follows it.
         given = jnp.all(jnp.isfinite(x0))
         x0 = jnp.where(given, x0, 0.0)
         fixed, bounds = jax.lax.stop_gradient((C, at(C, D, tight, x0)))
@@ -121,12 +122,37 @@ def _membership(c: Condensed, x0s: Array, width: Array, scale: Any, steps: int) 
         z, e = nearest_point(fixed, bounds, z, steps)
         usable = given & jnp.isfinite(jnp.sum(e**2) / width**4) & jnp.all(jnp.isfinite(z))
         x0, z = jnp.where(usable, x0, 0.0), jax.lax.stop_gradient(jnp.where(usable, z, 0.0))
-        residual = at(C, D, tight, x0).prox_residual(matmul(z, C.T), 1.0)
+        weights, normals = bounds.curvature(matmul(z, fixed.T), 1.0)
+
+        def distance(z: Array) -> Array:
+            e = at(C, D, tight, x0).prox_residual(matmul(z, C.T), 1.0)
+            # A row that the minimiser just touches is one that it keeps, in all derivatives.
+            return jnp.where(weights > 0, e, jax.lax.stop_gradient(e))
+
+        z = _following(z, matmul(distance(z), C), gram(fixed, weights, normals))
+        residual = distance(z)
         return jnp.where(usable, 1 / (1 + jnp.sum(residual**2) / width**2), 0.0)
 
     data = (c.C, c.D, c.d, c.lower, c.upper, c.radius)
     missing = jnp.any(jnp.array([jnp.any(jnp.isnan(part)) for part in jax.tree.leaves(data)]))
     return jnp.where(missing, jnp.nan, jax.vmap(one)(x0s.astype(dtype)))
+
+
+@jax.custom_jvp
+def _following(z: Array, gradient: Array, K: Array) -> Array:
+    """Return the minimiser z (n,), a constant, which follows the `gradient` there that the data
+    change: dz = −K⁻¹ d(gradient), K the Hessian (n, n)."""
+    return z
+
+
+@_following.defjvp
+def _(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    z, gradient, K = primals
+    # Where K has no curvature the gradient does not change but by rounding, which must stay small.
+    n = len(z)
+    ridge = jnp.finfo(z.dtype).eps ** (2 / 3) * (1 + jnp.trace(K) / n)
+    dz = -linalg.solve(K + ridge * jnp.eye(n, dtype=z.dtype), tangents[1])
+    return _following(z, gradient, K), dz
 
 
 def nearest_point(A: Array, bounds: Bounds, w: Array, steps: int) -> tuple[Array, Array]:

@@ -294,6 +294,33 @@ def group_sizes(batch: int, steps: Steps = "short", work: int = 0) -> list[int]:
     return sizes
 
 
+def batched_by(rule: Callable[..., R], function: Callable[..., R]) -> Callable[..., R]:
+    """Return the function, whose `vmap` is rule(size, in_batched, *arguments): the results with a
+    batch in front of each. in_batched: whether it is in front of each leaf of the arguments.
+
+    Where it is in front of none, as in derivatives of which the tangents alone have a batch, there
+    is no rule. (JAX is given leaves alone: it fails to differentiate forward through a rule with
+    None among its arguments.)
+    """
+
+    def call(*arguments: Any) -> R:
+        leaves, tree = jax.tree.flatten(arguments)
+        given = lambda leaves: jax.tree.unflatten(tree, leaves)
+        one = custom_vmap(lambda *leaves: function(*given(leaves)))
+
+        @one.def_vmap
+        @own_modes
+        def _(size: int, in_batched: list[bool], *leaves: Any) -> tuple[R, Any]:
+            batched = any(in_batched)
+            args = given(leaves)
+            out = rule(size, given(in_batched), *args) if batched else function(*args)
+            return out, jax.tree.map(lambda _: batched, out)
+
+        return one(*leaves)
+
+    return call
+
+
 def in_blocks(
     function: Callable[[C, S], R],
     constants: C,
@@ -307,11 +334,8 @@ def in_blocks(
     GPUs. large: size of blocks elsewhere than on a CPU, None for no blocks. `function` must close
     over no arrays. A batch of constants makes no blocks.
     """
-    one = custom_vmap(lambda constants, data: function(constants, data))
 
-    @one.def_vmap
-    @own_modes
-    def _(size: int, in_batched: tuple, constants: C, data: S) -> tuple[R, Any]:
+    def rule(size: int, in_batched: tuple, constants: C, data: S) -> R:
         axes = jax.tree.map(lambda b: 0 if b else None, in_batched[0])
         data = broadcast(size, in_batched[1], data)
         together = jax.vmap(function, in_axes=(axes, 0))
@@ -323,13 +347,12 @@ def in_blocks(
 
         small = not isinstance(size, int) or (size <= BLOCK and kernel is None)
         if any(jax.tree.leaves(in_batched[0])) or small:
-            return all_batched(together(constants, data))
+            return together(constants, data)
         others = {} if kernel is None else {"cuda": kernel}
         cpu, default = partial(blocks, BLOCK), partial(blocks, large or size)
-        out = lax.platform_dependent(constants, data, cpu=cpu, default=default, **others)
-        return all_batched(out)
+        return lax.platform_dependent(constants, data, cpu=cpu, default=default, **others)
 
-    return one(constants, data)
+    return batched_by(rule, function)(constants, data)
 
 
 def attempted_first(
@@ -346,12 +369,8 @@ def attempted_first(
     again(result, *arguments): the same result, computed from itself, with its derivatives. The
     functions must close over no arrays, and the first two be programs of `jax.jit`, traced once.
     """
-    # (What has no batch must vary over the axes over which results of the rule do.)
-    one = custom_vmap(own_modes(lambda *arguments: whole(*arguments)))
 
-    @one.def_vmap
-    @own_modes
-    def _(size: int, in_batched: list, *arguments: Any) -> tuple[R, Any]:
+    def rule(size: int, in_batched: tuple, *arguments: Any) -> R:
         leaves, tree = jax.tree.flatten(arguments)
         batched = tuple(jax.tree.leaves(in_batched))
 
@@ -360,9 +379,12 @@ def attempted_first(
             return jax.vmap(plain, in_axes=[0 if b else None for b in batched])
 
         if default_platform() != "cpu" or not isinstance(size, int) or 2 * size <= BLOCK:
-            return all_batched(many(whole)(*leaves))
+            return many(whole)(*leaves)
         run = partial(_attempted, many(attempt), many(whole), batched)
-        return all_batched(_of_one_batch(run, batched)(*leaves))
+        return _of_one_batch(run, batched)(*leaves)
+
+    # (What has no batch must vary over the axes over which results of the rule do.)
+    one = batched_by(rule, own_modes(whole))
 
     @jax.custom_jvp
     def found(*arguments: Any) -> R:
@@ -406,22 +428,20 @@ def _attempted(
 def _of_one_batch(run: Callable[..., R], batched: tuple[bool, ...]) -> Callable[..., R]:
     """Return `run`, of whose arguments some are `batched`, which works a further batch off as one
     with the first."""
-    batch = custom_vmap(own_modes(lambda *leaves: run(*leaves)))
 
-    @batch.def_vmap
-    @own_modes
-    def _(size: int, outer: list[bool], *leaves: Array) -> tuple[R, Any]:
+    def rule(size: int, outer: tuple[bool, ...], *leaves: Array) -> R:
         if any(o and not b for o, b in zip(outer, batched, strict=True)):
             # Each outer instance has constants that its inner batch shares: copies would not fit.
             axes = [0 if o else None for o in outer]
-            return all_batched(jax.vmap(run, in_axes=axes)(*leaves))
+            return jax.vmap(run, in_axes=axes)(*leaves)
         every = list(zip(leaves, batched, outer, strict=True))
         inner = next(v.shape[1 if o else 0] for v, b, o in every if b)
         copies = lambda v, o: v if o else jnp.broadcast_to(v, (size, *v.shape))
         merged = lambda v: v.reshape(size * inner, *v.shape[2:])
         out = batch(*(merged(copies(v, o)) if b else v for v, b, o in every))
-        return all_batched(jax.tree.map(lambda v: v.reshape(size, inner, *v.shape[1:]), out))
+        return jax.tree.map(lambda v: v.reshape(size, inner, *v.shape[1:]), out)
 
+    batch = batched_by(rule, own_modes(run))
     return batch
 
 
@@ -456,11 +476,8 @@ def repeat_while(
     """
     advance = lambda constants, state: varying(step(constants, state), state)
     one = lambda constants, state: lax.while_loop(is_open, partial(advance, constants), state)
-    single, state = custom_vmap(one), varying(state, (constants, state))
 
-    @single.def_vmap
-    @own_modes
-    def _(size: int, in_batched: tuple, constants: C, state: S) -> tuple[S, Any]:
+    def rule(size: int, in_batched: tuple, constants: C, state: S) -> S:
         leaves, tree = jax.tree.flatten(constants)
         batched = tuple(jax.tree.leaves(in_batched[0]))
         state = broadcast(size, in_batched[1], state)
@@ -477,9 +494,9 @@ def repeat_while(
             return _in_groups(jax.vmap(is_open), many, batched, constants, state, steps, work)
 
         both = *batched, *[True] * len(parts)
-        return all_batched(_of_one_batch(run, both)(*leaves, *parts))
+        return _of_one_batch(run, both)(*leaves, *parts)
 
-    return single(constants, state)
+    return batched_by(rule, one)(constants, varying(state, (constants, state)))
 
 
 def _in_groups(
@@ -524,17 +541,6 @@ def _in_groups(
         group = partial(advance_group, count, least)
         state = while_more(least, together if count == size else group, state)
     return state
-
-
-def all_batched(out: R) -> tuple[R, Any]:
-    """Return what a rule of batching does: the results, and that all of them are batched."""
-    return out, jax.tree.map(lambda _: True, out)
-
-
-def unbatched(out: R) -> tuple[R, Any]:
-    """Return what a rule of batching does where no argument is batched, as in derivatives of which
-    the tangents alone are."""
-    return out, jax.tree.map(lambda _: False, out)
 
 
 def true_places(mask: Array, size: int) -> Array:

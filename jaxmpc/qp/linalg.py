@@ -29,14 +29,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
-from jax.custom_batching import custom_vmap
 from jax.typing import DTypeLike
 
 from jaxmpc.qp.jax_transformations import (
-    all_batched,
+    batched_by,
     broadcast,
     own_modes,
-    unbatched,
     varying,
 )
 
@@ -181,18 +179,15 @@ def rounding(dtype: DTypeLike) -> float:
 
 
 def _with_x64(function: Callable) -> Callable:
-    @custom_vmap
     def wrapped(*arguments: Any) -> Any:
         with jax.enable_x64(True):
             return function(*arguments)
 
-    @wrapped.def_vmap
-    @own_modes
-    def batched(axis_size: int, in_batched: Any, *arguments: Any) -> Any:
-        axes = jax.tree.map(lambda b: 0 if b else None, tuple(in_batched))
-        return all_batched(_with_x64(jax.vmap(function, in_axes=axes))(*arguments))
+    def rule(size: int, in_batched: tuple, *arguments: Any) -> Any:
+        axes = jax.tree.map(lambda b: 0 if b else None, in_batched)
+        return _with_x64(jax.vmap(function, in_axes=axes))(*arguments)
 
-    return wrapped
+    return batched_by(rule, wrapped)
 
 
 def infinity_norm(v: Array) -> Array:
@@ -233,30 +228,19 @@ def batched(
     def each(*args: Array) -> Any:
         return lax.platform_dependent(*args, cpu=on_cpu, default=jax.vmap(one))
 
-    many = custom_vmap(each)
-
-    @many.def_vmap
-    @own_modes
-    def _(size: int, in_batched: Any, *args: Array) -> Any:
-        if not any(in_batched):
-            return unbatched(each(*args))
-        args = broadcast(size, tuple(in_batched), args)
+    def rule_of_many(size: int, in_batched: tuple, *args: Array) -> Any:
+        args = broadcast(size, in_batched, args)
         out = many(*(v.reshape(-1, *v.shape[2:]) for v in args))
-        return all_batched(jax.tree.map(lambda v: v.reshape(size, -1, *v.shape[1:]), out))
+        return jax.tree.map(lambda v: v.reshape(size, -1, *v.shape[1:]), out)
 
-    single = custom_vmap(one)
-
-    @single.def_vmap
-    @own_modes
-    def _(size: int, in_batched: Any, *args: Array) -> Any:
-        if not any(in_batched):
-            return unbatched(one(*args))
+    def rule(size: int, in_batched: tuple, *args: Array) -> Any:
         if columns and not in_batched[0]:
             M, B = args
             out = single(M, jnp.moveaxis(B, 0, -1).reshape(len(M), -1))
-            return jnp.moveaxis(out.reshape(*B.shape[1:], size), -1, 0), True
-        return all_batched(many(*broadcast(size, tuple(in_batched), args)))
+            return jnp.moveaxis(out.reshape(*B.shape[1:], size), -1, 0)
+        return many(*broadcast(size, in_batched, args))
 
+    many, single = batched_by(rule_of_many, each), batched_by(rule, one)
     return single
 
 

@@ -32,10 +32,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.custom_batching import custom_vmap
 
 from jaxmpc.pytrees import record
-from jaxmpc.qp.jax_transformations import unbatched
+from jaxmpc.qp.jax_transformations import batched_by
 from jaxmpc.robots.mujoco_access import BALL, FREE, SLIDE
 
 # What is read of mjx.Model.
@@ -453,13 +452,8 @@ def side_by_side(function: Callable) -> Callable:
         first = lambda v: jnp.moveaxis(jnp.broadcast_to(v, (*v.shape[:-1], count)), -1, 0)
         return jax.tree.map(first, out)
 
-    many = custom_vmap(plain)
-
-    @many.def_vmap
-    def _(size: int, in_batched: Any, *args: Any) -> Any:
-        if not any(jax.tree.leaves(in_batched)):
-            return unbatched(plain(*args))
-        lengths = jax.tree.map(lambda v, b: v.shape[1 if b else 0], args, tuple(in_batched))
+    def rule_of_many(size: int, in_batched: tuple, *args: Any) -> Any:
+        lengths = jax.tree.map(lambda v, b: v.shape[1 if b else 0], args, in_batched)
         count = max(jax.tree.leaves(lengths))
 
         def flat(v: Array, batched: bool) -> Array:
@@ -469,19 +463,13 @@ def side_by_side(function: Callable) -> Callable:
             v = jnp.broadcast_to(v, (size, count, *v.shape[2:]))
             return v.reshape(size * count, *v.shape[2:])
 
-        out = many(*jax.tree.map(flat, args, tuple(in_batched)))
-        out = jax.tree.map(lambda v: v.reshape(size, len(v) // size, *v.shape[1:]), out)
-        return out, jax.tree.map(lambda _: True, out)
+        out = many(*jax.tree.map(flat, args, in_batched))
+        return jax.tree.map(lambda v: v.reshape(size, len(v) // size, *v.shape[1:]), out)
 
-    batched = custom_vmap(single)
+    def rule(size: int, in_batched: tuple, *args: Any) -> Any:
+        return many(*jax.tree.map(lambda v, b: v if b else v[None], args, in_batched))
 
-    @batched.def_vmap
-    def _(size: int, in_batched: Any, *args: Any) -> Any:
-        if not any(jax.tree.leaves(in_batched)):
-            return unbatched(single(*args))
-        out = many(*jax.tree.map(lambda v, b: v if b else v[None], args, tuple(in_batched)))
-        return out, jax.tree.map(lambda _: True, out)
-
+    many, batched = batched_by(rule_of_many, plain), batched_by(rule, single)
     fast = jax.custom_jvp(batched)
     fast.defjvp(lambda primals, tangents: (fast(*primals), jax.jvp(single, primals, tangents)[1]))
     return fast

@@ -78,6 +78,10 @@ def bent(x, u):
     return x + u + 0.05 * jnp.sin(x[::-1])
 
 
+def wavy(size, x, u):
+    return x + u + size * jnp.sin(x[::-1])
+
+
 def mixed(at):
     return jnp.stack([jnp.sin(at.x[0]), at.x[1] * at.u[0]])
 
@@ -227,12 +231,38 @@ class TestDerivatives:
         # 90, at half steps, where corrections leave out that rows bend.
         assert status == SOLVED and iterations < 75
         assert np.sum(np.abs(multipliers.tasks[0]) > 1e-3) >= 1  # the disc is touched
-        np.testing.assert_allclose(J, jax.jacfwd(inputs, has_aux=True)(theta)[0], atol=1e-9)
+        np.testing.assert_allclose(J, jax.jacfwd(inputs, has_aux=True)(theta)[0], atol=1e-12)
         h = 1e-4
         for i in range(len(theta)):
             step = h * np.eye(len(theta))[i]
             difference = (inputs(theta + step)[0] - inputs(theta - step)[0]) / (2 * h)
             np.testing.assert_allclose(J[:, i], difference, atol=1e-5 * (1 + np.abs(J).max()))
+
+    @pytest.mark.slow
+    def test_of_second_order(self, x64):
+        """Hessians in weights, targets, limits, model and state, where the disc is touched, are
+        differences of gradients: with third derivatives of the model, of which the first order
+        needs none."""
+        task = Task(product, name="product")
+
+        def plan_at(theta):
+            problem = around(lower=theta[2])
+            tasks = (*problem.tasks, replace(task, weight=theta[0], target=theta[1:2].repeat(2)))
+            problem = replace(problem, model=jax.tree_util.Partial(wavy, theta[4]), tasks=tasks)
+            return solve_nonlinear(problem, START + theta[3:4], GOAL, jm.ADMM(eps=1e-10))
+
+        theta = jnp.array([0.7, 0.2, 1.0, 0.0, 0.05])
+        for part in (
+            lambda plan: jnp.sum(jnp.cos(plan.inputs)),
+            lambda plan: jnp.sum(plan.states**3),
+            lambda plan: plan.cost,
+        ):
+            slope = jax.jit(jax.grad(lambda theta, part=part: part(plan_at(theta))))
+            found = jax.jacfwd(slope)(theta)
+            steps = 1e-4 * np.eye(len(theta))
+            expected = [(slope(theta + v) - slope(theta - v)) / 2e-4 for v in steps]
+            np.testing.assert_allclose(found, found.T, atol=1e-10 * np.abs(found).max())
+            np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(found).max())
 
     @pytest.mark.slow
     def test_of_a_number_of_the_model(self, x64):

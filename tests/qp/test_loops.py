@@ -190,6 +190,25 @@ def test_blocks_are_the_batch():
     np.testing.assert_allclose(found, 2 * x.astype(np.float32) ** 2, rtol=1e-6)
 
 
+def test_second_derivatives_of_blocks_with_an_absent_argument():
+    """Forward over reverse, where JAX does not take None for an argument of a rule; and where
+    nothing but tangents is a batch, so that the rule has none."""
+
+    def scaled(constants, data):
+        return jnp.sin(constants[0] * data) if constants[1] is None else data
+
+    def total(x, starts):
+        return jnp.sum(jax.vmap(lambda s: in_blocks(scaled, (x, None), s))(starts))
+
+    starts, x = jnp.linspace(0.1, 1, 7), jnp.float32(0.5)
+    expected = -jnp.sum(starts**2 * jnp.sin(x * starts))
+    for second in (jax.jacfwd(jax.grad(total)), jax.jacrev(jax.jacfwd(total))):
+        np.testing.assert_allclose(second(x, starts), expected, rtol=1e-5)
+    one = lambda x: in_blocks(scaled, (x, None), jnp.float32(0.7))
+    expected = -0.49 * jnp.sin(0.35)
+    np.testing.assert_allclose(jax.jacfwd(jax.jacfwd(one))(x), expected, rtol=1e-5)
+
+
 @pytest.mark.slow
 def test_an_answer_is_its_own_in_any_batch():
     """Feasible and infeasible programs side by side: those of a batch of one."""

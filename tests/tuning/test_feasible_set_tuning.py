@@ -63,6 +63,25 @@ def test_gradient_by_central_differences(fraction):
         np.testing.assert_allclose(gradient[i], expected, rtol=1e-4, err_msg=str(i))
 
 
+@jax.enable_x64(True)
+def test_second_derivatives_by_central_differences():
+    """The minimiser follows the data: as a constant it left Hessians that were off by 14 times."""
+    rows = jm.LinearSystem([[1, 0.1], [0.2, 1]], [[0], [0.1]])
+    mpc = jm.MPC(rows, [1.0, 1.0], [0.1], 5, states=jm.Box([-2, -2], [2, 2]))
+    grid = np.random.default_rng(0).uniform(-2, 2, (40, 2))
+
+    def value(w):
+        A = jnp.asarray(rows.A) + 0.1 * w[1]
+        most = 0.5 * jnp.exp(w[:1])
+        other = replace(mpc, system=replace(rows, A=A), inputs=jm.Box(-most, most))
+        return feasible_fraction(other, grid)
+
+    slope, w = jax.jit(jax.grad(value)), jnp.array([0.1, 0.2])
+    expected = [(slope(w + v) - slope(w - v)) / 2e-5 for v in 1e-5 * np.eye(2)]
+    found = jax.jacfwd(jax.grad(value))(w)
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5 * np.abs(found).max())
+
+
 def test_states_that_are_no_numbers_count_zero_and_spoil_nothing(fraction):
     value, gradient, each = fraction(POINT)
     np.testing.assert_array_equal(each[:4], [0, 0, 0, 1])

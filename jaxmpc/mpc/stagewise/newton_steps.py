@@ -67,8 +67,7 @@ LEAST_SLACK, FRACTION, REST = 1e-2, 0.995, 1e-8
 MOST_CURVED = 10.0
 # Where rounding stops the method: its own residuals, once below BEGUN, grow LOST times.
 BEGUN, LOST = 1e-3, 100.0
-# κ of derivatives, two steps of which leave a share of 1e-8 where Newton's would leave 1e-4; with
-# 1e9 rounding was seen, 2e-8.
+# κ of derivatives: where Newton's leaves a share of 1e-2 this leaves 1e-4 at each step.
 KAPPA = 1e8
 # Of a proximal term on the multipliers: weights of 1e11 and more would be lost in rounding.
 DAMPING = 1e-11
@@ -357,9 +356,12 @@ def stage_conditions(
             return flat(*jax.jvp(step, zero, (c, gradient))[1])
 
         # The proximal step on y leaves a share 1/(1 + κ s²) where the active rows have the least
-        # singular value s, which is small where inputs cost little; a second step the square of it.
-        first = follow(b)
-        return first + follow(b - J(s, E, rho, v, first))
+        # singular value s, which is small where inputs cost little; a second step the square of it,
+        # and the rounding of κ, which a third takes away.
+        found = follow(b)
+        for _ in range(2):
+            found = found + follow(b - J(s, E, rho, v, found))
+        return found
 
     def transposed(s: Stages, E: Array, rho: Array, v: Array, b: Array) -> Array:
         return jax.linear_transpose(partial(inverse, s, E, rho, v), b)(b)[0]

@@ -216,12 +216,17 @@ def _solve(
             gains = jax.tree.map(lambda v: v[None], riccati(s, rho * E**2))
         factor = StageFactor(s, E, rho[None], gains, fault)
         found = stage_solution(factor, s, solver, WarmStart(x, u, y))
+        x = predict(s, found.z)
     else:
-        at_solution = jax.lax.stop_gradient((E, rho, base, problem))
-        u, y = implicit(nonlinear_conditions, s, at_solution, u, y)
-        found = assess(nonlinear_residuals, (s, E), u, y, Proof.none(u, y), eps)
+        measured = jax.lax.stop_gradient((s, E))
+        z = jnp.concatenate([predict(measured[0], u).ravel(), u.ravel()])
+        at_solution = jax.lax.stop_gradient((E, rho))
+        z, y = implicit(nonlinear_conditions, (base, problem), at_solution, z, y)
+        x, u = _states_inputs(s, z)
+        found = assess(nonlinear_residuals, measured, u, y, Proof.none(u, y), eps)
+        s = expanded(base, problem, x, u)
+    u = found.z
     found = replace(found, iterations=jnp.asarray(count, jnp.int32))
-    x, u = predict(s, found.z), found.z
     plan = answer(mpc, s.layout, found, fault, s.of_system(x), u, aim)
     return with_tasks(plan, s, base, problem, x)
 
@@ -363,23 +368,45 @@ def nonlinear_residuals(s: Stages, E: Array, u: Array, y: Array) -> Terms:
 
 
 def nonlinear_conditions(
-    s: Stages, constants: tuple, u: Array, y: Array
+    data: tuple[Stages, NonlinearMPC], constants: tuple[Array, Array], z: Array, y: Array
 ) -> tuple[Callable[[Any], Any], Undo]:
-    """The `conditions_of` that `implicit` takes for the expansion about a solution: those of the
-    QP, with the Hessian of the Lagrangian.
+    """The `conditions_of` that `implicit` takes for the solution z, its states and inputs: those of
+    the expansion about it, with the Hessian of the Lagrangian, and its states.
 
-    The gradients of an expansion about a fixed point, which depend on the data, and this Hessian,
-    which is a constant, are the first derivatives of the optimality conditions of the nonlinear
-    problem with respect to the data and to x, u.
+    Of an expansion about a fixed point the gradients and states, which depend on the data, and this
+    Hessian are the first derivatives of the optimality conditions of the nonlinear problem with
+    respect to the data and to x, u. The point and the Hessian follow from data, z and y, so that
+    derivatives of higher order are those of the nonlinear problem too.
     """
-    E, rho, base, problem = constants
+    x, u = _states_inputs(data[0], z)
+    about = lambda data: expanded(data[0], data[1], x, u)
+    s, (base, problem), (E, rho) = about(data), data, constants
     lam = costates(s, u, s.bounds.admissible(y))
-    exact = curved(s, base, problem, s.aim.states, u, lam, y)
+    exact = curved(s, base, problem, x, u, lam, y)
     # Elsewhere than at a strict minimum, as where the search has not ended, the exact one has no
     # solution: NaN would spoil the sums of a batch.
-    bent = jax.lax.stop_gradient(where_hessian(convex_with(exact, held(s, E, y)), exact, s))
+    convex = convex_with(*jax.lax.stop_gradient((exact, held(s, E, y))))
+    bent = where_hessian(convex, exact, s)
     conditions, undo = stage_conditions(with_hessian(s, bent), (E, rho), u, y)
-    return lambda s: conditions(with_hessian(s, bent)), undo
+
+    def conditions_at(data: Any) -> tuple[Array, Array]:
+        s = about(data)
+        return conditions(with_hessian(s, bent)), predict(s, u)
+
+    def undo_all(moved: tuple[Array, Array]) -> tuple[Array, Array]:
+        du, dy = undo(moved[0])
+        dx = recurrence(s.A, apply(s.B, du), jnp.zeros_like(x[0]))
+        dx = moved[1] + jnp.pad(dx, ((1, 0), (0, 0)))
+        return jnp.concatenate([dx.ravel(), du.ravel()]), dy
+
+    return conditions_at, undo_all
+
+
+def _states_inputs(s: Stages, z: Array) -> tuple[Array, Array]:
+    """Return states (N+1, n) and inputs (N, m) of the vector of both."""
+    n, m = s.B.shape[-2:]
+    states = (s.horizon + 1) * n
+    return z[:states].reshape(-1, n), z[states:].reshape(-1, m)
 
 
 def with_hessian(s: Stages, other: Stages) -> Stages:
