@@ -126,13 +126,19 @@ class Robot(RobotDescription):
     def _transition(self, x: Array, u: Array) -> tuple[Array, Array]:
         nq, nv = self.mujoco.nq, self.mujoco.nv
 
-        def motion(d: Array, u: Array) -> Array:
+        def motion(d: Array, u: Array) -> tuple[Array, Array]:
             moved = jnp.concatenate([retract(self.joints, x[:nq], d[:nv]), x[nq:] + d[nv:]])
-            y = self.plant.step(moved, u, self.numbers)
-            at = jax.lax.stop_gradient(y[:nq])
-            return jnp.concatenate([difference(self.joints, at, y[:nq]), y[nq:]])
+            return (self.plant.step(moved, u, self.numbers),) * 2
 
-        A, B = jax.jacfwd(motion, argnums=(0, 1))(jnp.zeros(self.n, x.dtype), u)
+        zero = jnp.zeros(self.n, x.dtype)
+        slopes, y = jax.jacfwd(motion, argnums=(0, 1), has_aux=True)(zero, u)
+
+        def tangent(after: Array) -> Array:
+            """Return the way from y to another state, both of which x moves."""
+            return jnp.concatenate([difference(self.joints, y[:nq], after[:nq]), after[nq:]])
+
+        along = lambda column: jax.jvp(tangent, (y,), (column,))[1]
+        A, B = (jax.vmap(along, in_axes=1, out_axes=1)(slope) for slope in slopes)
         return A, B
 
     def equilibrium(self, q: Any = None, *, near: Any = None) -> tuple[np.ndarray, np.ndarray]:

@@ -217,6 +217,26 @@ def test_weights_are_tuned_through_the_loop():
 
 
 @pytest.mark.slow
+def test_real_time_iterations_with_tasks_have_derivatives():
+    """Of a task whose target is out of reach also the weights that stand for its curvature move,
+    which as constants left gradients off by 1 %."""
+    hand = Task(lambda at: jnp.stack([jnp.sin(at.x[0]), jnp.cos(at.x[0])]), name="hand")
+    model = lambda x, u: jnp.stack([x[0] + H * x[1], x[1] + H * (u[0] - jnp.sin(x[0]))])
+    free = replace(cart(model), mpc=replace(cart(model).mpc, inputs=jm.Box(-20, 20)))
+
+    def loss(theta):
+        pulled = replace(hand, weight=theta[0], target=theta[1:3])
+        controller = jm.NonlinearController(replace(free, tasks=(pulled,)), sqp_steps=1)
+        run = jm.simulate(controller, model, jnp.array([0.3, 0.0]) + theta[3], 3)
+        return jnp.sum(run.states**2) + jnp.sum(run.inputs**2)
+
+    theta, value = jnp.array([0.3, 1.5, 0.5, 0.1]), jax.jit(loss)
+    expected = [(value(theta + v) - value(theta - v)) / 2e-5 for v in 1e-5 * np.eye(4)]
+    assert np.abs(expected).min() > 0.01
+    np.testing.assert_allclose(jax.grad(loss)(theta), expected, rtol=1e-6)
+
+
+@pytest.mark.slow
 def test_an_extended_kalman_filter_of_the_model():
     """Two positions of a pendulum-like cart measured with noise: the estimate is nearer to the
     state than what is measured, and the loop comes to rest."""

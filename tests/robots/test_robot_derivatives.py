@@ -137,6 +137,30 @@ AT = [np.array([q, 0.1]) for q in (0.1, 0.39, 0.403)]
 
 
 @pytest.mark.slow
+@jax.enable_x64(True)
+def test_linear_models_of_turning_bodies_have_derivatives():
+    """dA and dB along a path on which a free body turns: both ends of the way whose derivative A is
+    move with the state, which left 7 times the derivative."""
+    model = mujoco.MjModel.from_xml_string("""
+        <mujoco><option timestep="0.01"/><worldbody><body><freejoint/>
+        <geom type="box" size=".1 .2 .3" mass="1"/><site name="top" pos="0 0 .3"/>
+        </body></worldbody><actuator><motor site="top" gear="1 2 0 0 1 1" ctrlrange="-9 9"/>
+        </actuator></mujoco>""")
+    robot, u = jm.load_robot(model), np.array([0.5])
+    turn = np.array([0.3, 0.4, -0.5, 0.2])
+
+    def matrices(s):
+        q = jnp.array([1.0, 0, 0, 0]) + s * turn
+        x = jnp.concatenate([s * jnp.ones(3), q / jnp.linalg.norm(q), s * jnp.arange(6) - 1])
+        return jnp.concatenate(robot.transition(x, u), axis=1)
+
+    found = jax.jacfwd(matrices)(0.7)
+    expected = (matrices(0.7 + 1e-5) - matrices(0.7 - 1e-5)) / 2e-5
+    assert np.abs(expected).max() > 0.01
+    np.testing.assert_allclose(found, expected, atol=1e-7)
+
+
+@pytest.mark.slow
 def test_derivatives_with_elliptic_contacts():
     """NaN if differentiated through MJX's solver, which friction makes iterate, though nothing
     touches."""

@@ -358,7 +358,7 @@ def majorant(
         pulled = lambda z: jnp.sum(error * problem.value(task, z[:n], z[n:])) / 2
         return jnp.sum(jnp.abs(jax.jacfwd(jax.grad(pulled))(jnp.concatenate([x, u]))), axis=1)
 
-    found = jax.lax.stop_gradient(jax.vmap(sums)(x, u, error))
+    found = jax.vmap(sums)(x, u, error)
     diagonal = lambda v: v[:, :, None] * jnp.eye(v.shape[1], dtype=v.dtype)
     return diagonal(found[:, :n]), diagonal(found[:, n:])
 
