@@ -107,8 +107,7 @@ class NonlinearController:
     @property
     def reference_sizes(self) -> tuple[int, ...]:
         """Return how many columns `reference` may have: n, or those and the tasks' targets."""
-        n = self.state_size
-        return (n, n + self.problem.targets) if self.problem.tasks else (n,)
+        return reference_sizes(self.problem)
 
     def coordinates(self, x: Array) -> Array:
         """Return the state in which the problem is written: x itself."""
@@ -135,50 +134,71 @@ class NonlinearController:
         """
         x = one_state(self, x)
         require_before(before)
-        problem, rows = self.problem, layout(self.mpc) + task_layout(self.problem)
-        memory = None if before is None else before.memory
-        last = last_input(self.mpc, before, previous_input)
-        if memory is None:
-            start = WarmStart(
-                *at_rest(self, x, input_reference), jnp.zeros(row_count(rows), x.dtype)
-            )
-        else:
-            start = memory.shifted(rows, memory.inputs[-1])
-        reference, targets = self._targets(reference)
-        plan = solve_nonlinear(
-            problem, x, reference, self.solver, anchored(start, x),
-            input_reference=input_reference, previous_input=last, targets=targets,
-            iterations=self.sqp_steps, hessian=self.hessian, scale=self.scale,
-        )  # fmt: skip
-        return applied(self.mpc, rows, plan, memory, last)
+        search = {"iterations": self.sqp_steps, "hessian": self.hessian, "scale": self.scale}
+        aims = {"input_reference": input_reference, "previous_input": previous_input}
+        return sqp_control(self.problem, self.solver, x, before, reference, **aims, **search)
 
-    def _targets(self, reference: Any) -> tuple[Any, Any]:
-        """Return the reference of the states and those of the tasks, None for their own."""
-        N, n = self.mpc.horizon, self.state_size
-        if reference is None:
-            return None, None
-        shapes = [shape for size in self.reference_sizes for shape in ((size,), (N + 1, size))]
-        reference = checked_array("reference", reference, shapes)
-        if np.shape(reference)[-1] == n:
-            return reference, None
-        ends = n + np.cumsum(self.problem.sizes())[:-1]
-        reference, *targets = jnp.split(jnp.asarray(reference), [n, *ends], axis=-1)
-        return reference, targets
+
+def sqp_control(
+    problem: NonlinearMPC,
+    solver: ADMM,
+    x: Array,
+    before: Control[Plan] | None,
+    reference: Any,
+    *,
+    input_reference: Any,
+    previous_input: Any,
+    **search: Any,
+) -> Control[Plan]:
+    """Return what a controller gives at x (n,), planned about the plan of `before`, shifted by one
+    step, or about rest. search: other arguments of `solve_nonlinear`."""
+    mpc, rows = problem.mpc, layout(problem.mpc) + task_layout(problem)
+    memory = None if before is None else before.memory
+    last = last_input(mpc, before, previous_input)
+    if memory is None:
+        blank = jnp.zeros(row_count(rows), x.dtype)
+        start = WarmStart(*at_rest(mpc, x, input_reference), blank)
+    else:
+        start = memory.shifted(rows, memory.inputs[-1])
+    reference, targets = _with_targets(problem, reference)
+    plan = solve_nonlinear(
+        problem, x, reference, solver, anchored(start, x),
+        input_reference=input_reference, previous_input=last, targets=targets, **search,
+    )  # fmt: skip
+    return applied(mpc, rows, plan, memory, last)
+
+
+def reference_sizes(problem: NonlinearMPC) -> tuple[int, ...]:
+    """Return how many columns a reference may have: n, or those and the tasks' targets."""
+    return (problem.n, problem.n + problem.targets) if problem.tasks else (problem.n,)
+
+
+def _with_targets(problem: NonlinearMPC, reference: Any) -> tuple[Any, Any]:
+    """Return the reference of the states and those of the tasks, None for their own."""
+    N, n = problem.mpc.horizon, problem.n
+    if reference is None:
+        return None, None
+    shapes = [shape for size in reference_sizes(problem) for shape in ((size,), (N + 1, size))]
+    reference = checked_array("reference", reference, shapes)
+    if np.shape(reference)[-1] == n:
+        return reference, None
+    ends = n + np.cumsum(problem.sizes())[:-1]
+    reference, *targets = jnp.split(jnp.asarray(reference), [n, *ends], axis=-1)
+    return reference, targets
 
 
 def resting_start(controller: Feedback, x: Array, input_reference: Any) -> Control[Plan]:
     """Return what stands for the time step before the first of a controller whose plans are about
     a trajectory: at rest at x under the first input of input_reference, zero for none."""
     zeros = zeros_of(partial(controller, input_reference=input_reference), x)
-    states, inputs = at_rest(controller, x, input_reference)
+    states, inputs = at_rest(controller.mpc, controller.coordinates(x), input_reference)
     assert zeros.memory is not None
     memory = zeros.memory._replace(states=states, inputs=inputs)
     return zeros._replace(u=inputs[0], memory=memory)
 
 
-def at_rest(controller: Feedback, x: Array, input_reference: Any) -> tuple[Array, Array]:
-    """Return states (N+1, n) that stay at x and inputs (N, m), the first of input_reference."""
-    mpc, xi = controller.mpc, controller.coordinates(x)
+def at_rest(mpc: MPC, xi: Array, input_reference: Any) -> tuple[Array, Array]:
+    """Return states (N+1, n) that stay at ξ and inputs (N, m), the first of input_reference."""
     u = first_row(np.zeros(mpc.system.m) if input_reference is None else input_reference, xi.dtype)
     states = jnp.broadcast_to(xi, (mpc.horizon + 1, len(xi)))
     return states, jnp.broadcast_to(u, (mpc.horizon, mpc.system.m))

@@ -15,10 +15,11 @@ from jaxmpc.arrays import Reals, as_weight, host_array
 from jaxmpc.checks import concrete, fail, whole
 from jaxmpc.closed_loop.feedback import one_state
 from jaxmpc.closed_loop.nonlinear_controller import (
-    NonlinearController,
     at_rest,
     last_input,
+    reference_sizes,
     resting_start,
+    sqp_control,
 )
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.plan import Control, Plan, applied, limited, require_before
@@ -368,12 +369,13 @@ class RobotController:
             what = f"given with linearize={self.linearize!r}"
             fail("forecast", what, 'Give linearize="set-point", or leave it out')
         if self.linearize == "trajectory":
-            return self.nonlinear(xi, before, reference, **known)
+            search = {"iterations": self.sqp_steps, "hessian": self.hessian, "scale": self.scale}
+            return sqp_control(self.problem, self.solver, xi, before, reference, **known, **search)
         memory = None if before is None else before.memory
         last = last_input(self.soft, before, previous_input)
         rows = layout(self.soft)
         start = None if memory is None else memory.shifted(rows, memory.inputs[-1])
-        inputs = at_rest(self, x, input_reference)[1] if memory is None else memory.inputs
+        inputs = at_rest(self.soft, xi, input_reference)[1] if memory is None else memory.inputs
         system = self.robot.linearize(x, limited(self.soft.inputs, inputs[0]), exact=self.exact)
         known |= {"previous_input": last, "scale": self.scale}
         mpc = replace(self.soft, system=system)
@@ -381,16 +383,14 @@ class RobotController:
         return applied(self.soft, rows, plan, memory, last)
 
     @property
-    def nonlinear(self) -> NonlinearController:
-        """Return the controller of "trajectory", in the coordinates."""
-        problem = NonlinearMPC(self.soft, as_model(self.robot, self.exact), self.tasks)
-        steps, hessian = self.sqp_steps, self.hessian
-        return NonlinearController(problem, self.solver, steps, hessian, self.scale)
+    def problem(self) -> NonlinearMPC:
+        """Return the nonlinear problem of "trajectory"."""
+        return NonlinearMPC(self.soft, as_model(self.robot, self.exact), self.tasks)
 
     @property
     def reference_sizes(self) -> tuple[int, ...]:
         """Return how many columns `reference` may have: n, or those and the tasks' targets."""
-        return self.nonlinear.reference_sizes if self.tasks else (self.mpc.system.n,)
+        return reference_sizes(self.problem) if self.tasks else (self.mpc.system.n,)
 
 
 def as_model(robot: Any, exact: bool = True) -> Any:

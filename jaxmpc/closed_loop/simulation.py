@@ -287,10 +287,9 @@ class Loop:
     """One closed loop: what its time steps share."""
 
     def __init__(self, controller: Feedback, plant: Plant, given: Conditions, dtype: Any) -> None:
-        self.controller, self.given = controller, given
+        self.controller, self.plant, self.given = controller, plant, given
         own = getattr(controller, "observer", None)
         self.observer: KalmanFilter | None = given.observer if own is None else own
-        self.plant = plant
         self.horizon = controller.mpc.horizon
         weights = weights_of(replace(controller.mpc, stage_weights=None), dtype)
         # Where they differ from step to step a time step costs what the first of a plan does.

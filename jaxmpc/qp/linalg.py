@@ -31,12 +31,7 @@ import numpy as np
 from jax import Array, lax
 from jax.typing import DTypeLike
 
-from jaxmpc.qp.jax_transformations import (
-    batched_by,
-    broadcast,
-    own_modes,
-    varying,
-)
+from jaxmpc.qp.jax_transformations import batched_by, broadcast, own_modes, varying
 
 T = TypeVar("T")
 A = TypeVar("A", Array, np.ndarray)

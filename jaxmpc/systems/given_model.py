@@ -79,12 +79,8 @@ def as_argument(model: Any) -> Any:
     """Return a model or plant as an argument of a program: itself where it is a pytree of arrays
     with a method `step`."""
     leaves, tree = jax.tree.flatten(model)
-    alone = jax.tree_util.all_leaves([model])
-    if (
-        hasattr(model, "step")
-        and not alone
-        and not any(callable(v) or isinstance(v, str) for v in leaves)
-    ):
+    plain = not any(callable(v) or isinstance(v, str) for v in leaves)
+    if plain and hasattr(model, "step") and not jax.tree_util.all_leaves([model]):
         return model
     is_number = [isinstance(v, jax.Array | np.ndarray | np.inexact | float) for v in leaves]
     numbers = tuple(v for v, has in zip(leaves, is_number, strict=True) if has)

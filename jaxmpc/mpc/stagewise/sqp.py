@@ -224,7 +224,7 @@ def _solve(
         z, y = implicit(nonlinear_conditions, (base, problem), at_solution, z, y)
         x, u = _states_inputs(s, z)
         found = assess(nonlinear_residuals, measured, u, y, Proof.none(u, y), eps)
-        s = expanded(base, problem, x, u)
+        s = expanded(base, problem, x, u) if problem.tasks else s
     u = found.z
     found = replace(found, iterations=jnp.asarray(count, jnp.int32))
     plan = answer(mpc, s.layout, found, fault, s.of_system(x), u, aim)
