@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.arrays import Reals, as_weight, host_array
-from jaxmpc.checks import concrete, fail, whole
+from jaxmpc.checks import concrete, fail, require_untraced, whole
 from jaxmpc.closed_loop.feedback import one_state
 from jaxmpc.closed_loop.nonlinear_controller import (
     at_rest,
@@ -95,7 +95,8 @@ def robot_mpc(
         x, u = robot.set_point(target)
     names = robot.state_names or tuple(f"coordinate {i}" for i in range(robot.n))
     states = _around(robot.state_limits, margin, host_coordinates(robot, x), names)
-    with jax.enable_x64(True):
+    # Inside jit too the robot is known, be the weights traced.
+    with jax.enable_x64(True), jax.ensure_compile_time_eval():
         system = jax.tree.map(np.asarray, robot.linearize(x, u, exact=exact))
     mpc = MPC(system, Q, R, horizon, states=states, inputs=robot.input_limits)
     mpc.validate()
@@ -103,11 +104,12 @@ def robot_mpc(
         if terminal_cost != "lqr":
             fail("terminal_cost", f"{terminal_cost!r}", 'Give "lqr", a matrix or None')
         named = () if stands(robot) else names  # feet that stand are not moved, as they shall
-        terminal_cost = _terminal_cost(system, np.asarray(Q), R, named) if rests else None
+        terminal_cost = _terminal_cost(system, Q, R, named) if rests else None
     usual = {"constrained_stages": tuple(range(1, horizon + 1)), "terminal_cost": terminal_cost}
     mpc = replace(mpc, **{**usual, **fields})
     if isinstance(robot, Robot):
-        added = _limits_of_forces(robot, x, u, states, horizon)
+        with jax.ensure_compile_time_eval():
+            added = tuple(_limits_of_forces(robot, x, u, states, horizon))
         mpc = replace(mpc, outputs=(*as_tuple("outputs", mpc.outputs, Outputs), *added))
     mpc.validate()
     return mpc
@@ -163,9 +165,7 @@ def _around(limits: Box, margin: float, point: np.ndarray, names: tuple[str, ...
     return Box(low, high)
 
 
-def _terminal_cost(
-    system: LinearSystem, Q: np.ndarray, R: Reals, names: tuple[str, ...]
-) -> np.ndarray:
+def _terminal_cost(system: LinearSystem, Q: Reals, R: Reals, names: tuple[str, ...]) -> Reals:
     """Return P of the LQR; where inputs do not move all modes that last, P = T P_r T' with P_r of
     the LQR on the subspace that they reach, T (n, r) an orthonormal basis of it.
 
@@ -174,11 +174,14 @@ def _terminal_cost(
     """
     A, B, _ = host_matrices(system)
     if least_reached(A, B)[0] > UNREACHED:
-        return np.asarray(lqr(system, Q, R).P)
-    r = host_array("R", R)
-    units = natural_units(A, B, Q, r)
+        return lqr(system, Q, R).P
+    cure = 'Give terminal_cost=None or a matrix: inputs do not move all states, and "lqr" reads it'
+    for name, weight in (("Q", Q), ("R", R)):
+        require_untraced(name, weight, cure)
+    q, r = host_array("Q", Q), host_array("R", R)
+    units = natural_units(A, B, q, r)
     A, B = units.system(A, B)
-    Q, r = units.weights(Q, r)
+    q, r = units.weights(q, r)
     T = reached_subspace(A, B)
     if names:
         unmoved = np.flatnonzero(np.linalg.norm(T, axis=1) < 0.999)
@@ -188,7 +191,7 @@ def _terminal_cost(
             stacklevel=3,
         )
     reduced = LinearSystem(T.T @ A @ T, T.T @ B)
-    return units.cost_matrix(T @ np.asarray(lqr(reduced, T.T @ Q @ T, r).P) @ T.T)
+    return units.cost_matrix(T @ np.asarray(lqr(reduced, T.T @ q @ T, r).P) @ T.T)
 
 
 def reached_subspace(A: np.ndarray, B: np.ndarray) -> np.ndarray:

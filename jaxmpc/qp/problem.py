@@ -136,6 +136,18 @@ class Bounds:
         slope = jnp.where(soft, self.linear, 0.0) + self.quadratic * jnp.abs(s)
         return jnp.where(soft, sign(s) * slope, 0.0)
 
+    def unmoved(self, scale: Array, v: Array) -> Array:
+        """Return the multipliers at v (m,) of soft rows that no variable moves (scale 0): what
+        their penalty grows by with them, and no optimality condition asks for; 0 in others."""
+        return jnp.where(scale == 0, self.penalty_gradient(v), 0.0)
+
+    def following(self, y: Array, scale: Array, v: Array) -> Array:
+        """Return y (m,) with the derivatives of the multipliers of rows that nothing moves."""
+        if self.linear is None:
+            return y
+        paid = self.unmoved(scale, v)
+        return y + (paid - jax.lax.stop_gradient(paid))
+
     def violation(self, v: Array) -> Array:
         """Return v minus its projection where a constraint is hard; 0 in soft rows."""
         return self.hard().prox_residual(v, 1.0)

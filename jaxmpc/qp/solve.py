@@ -217,6 +217,7 @@ def solve_factored(
         constants = jax.lax.stop_gradient((clean, factor, solver, warm_start))
         found = search(*constants, whole) if found is None else found
         z, y = implicit(dense_conditions, clean, (constants[1], solver.smoothing), found.z, found.y)
+        y = clean.bounds.following(y, constants[1].E, matmul(z, clean.A.T))
     else:
         found = search(clean, factor, solver, warm_start, whole)
         z, y = found.z, found.y

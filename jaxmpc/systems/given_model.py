@@ -1,13 +1,14 @@
 """Models and plants that users write, as arguments of compiled programs."""
 
 from dataclasses import dataclass
+from types import FunctionType
 from typing import Any
 
 import jax
 import numpy as np
 from jax import Array
 
-from jaxmpc.pytrees import pytree, static_pytree
+from jaxmpc.pytrees import pytree, short_value, static, static_pytree
 
 
 class Number:
@@ -64,10 +65,42 @@ class GivenModel:
         given = self.given
         return getattr(given, "step", given)(x, u)
 
+    def __call__(self, *values: Any) -> Any:
+        """Return what the function gives."""
+        return self.given(*values)
+
+    def __repr__(self) -> str:
+        return short_value(self.given)
+
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_") or name in ("numbers", "constant"):
             raise AttributeError(name)
         return getattr(self.given, name)
+
+
+@pytree
+class ClosedFunction:
+    """A function, or the model that is one, with the traced arrays that it closed over as data."""
+
+    numbers: tuple
+    function: Any = static()
+
+    def __call__(self, *values: Any) -> Any:
+        """Return what the function gives."""
+        return self.function(*values, *self.numbers)
+
+    step = __call__
+
+
+def closed(model: Any, *examples: Any) -> Any:
+    """Return what `as_argument` made of a function, with the traced arrays that the function closes
+    over as data. Loops and rules of derivatives take such arrays as arguments alone.
+
+    examples: of its arguments, arrays or their types."""
+    if not isinstance(model, GivenModel) or not isinstance(model.constant.given, FunctionType):
+        return model
+    function, numbers = jax.closure_convert(model.constant.given, *examples)
+    return ClosedFunction(tuple(numbers), function) if numbers else model
 
 
 def is_model(model: Any) -> bool:

@@ -51,7 +51,7 @@ def lqr(system: LinearSystem, Q: Reals, R: Reals) -> LQR:
         Q: (n, n), symmetric positive semidefinite; or its diagonal (n,), or a number for n = 1.
         R: (m, m), symmetric positive definite; or its diagonal (m,), or a number for m = 1.
 
-    NumPy in float64; not traceable. Raises ValueError if Q or R is not as above, or if a mode that
+    Computed by NumPy in float64. Raises ValueError if Q or R is not as above, or if a mode that
     does not decay by itself cannot be moved by u (not stabilizable) or costs nothing (not
     detectable). The message names its coordinates and its eigenvalue.
 

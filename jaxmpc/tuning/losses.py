@@ -8,7 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxmpc.arrays import as_array
 from jaxmpc.checks import (
+    concrete,
     fail,
     number,
     require_finite,
@@ -29,6 +31,11 @@ TERMS = ("tracking", "effort", "violation", "settling")
 TERM = "loss "
 
 
+def _counts(weight: Any) -> bool:
+    """Return whether a weight is not known to be 0."""
+    return not concrete(weight) or bool(weight)
+
+
 @record
 class ClosedLoopLoss:
     """Loss of one closed loop: tracking, effort, violations and time to settle,
@@ -36,8 +43,8 @@ class ClosedLoopLoss:
         (1/T) Σ_{t<T} [ e_t'Q e_t + v_t'R v_t ] + violation·(1/T) Σ_{t≤T} Σ_i excess_i(x_t)
         + settling·(time to settle),    e_t = x_t − r_t,  v_t = u_t − s_t.
 
-    Q (n, n), R (m, m): or their diagonals, or a number for one state or input. They are fixed: the
-    controller's own weights, which `Run.stage_cost` uses, would be driven to zero.
+    Q (n, n), R (m, m): or their diagonals, or a number for one state or input. Weights of the loss,
+    not the controller's own, which `Run.stage_cost` uses: tuning would drive those to zero.
     reference: r (n,), or at least T rows; None for zero.
     input_reference: s (m,), or at least T rows; None for zero.
     limits: Box or Polytope of x; excess_i is by how much row i is violated, in its unit, of a Box
@@ -66,8 +73,9 @@ class ClosedLoopLoss:
 
     def __post_init__(self) -> None:
         for name in ("Q", "R"):
-            W = np.asarray(getattr(self, name), np.float64)
-            W = np.diag(np.atleast_1d(W)) if W.ndim < 2 else W
+            W = as_array(getattr(self, name))
+            W = W if isinstance(W, jax.core.Tracer) else np.asarray(W, np.float64)
+            W = (np if isinstance(W, np.ndarray) else jnp).diag(W.reshape(-1)) if W.ndim < 2 else W
             if W.ndim != 2 or W.shape[0] != W.shape[1]:
                 fail(name, f"shape {W.shape}", "Give a square matrix, its diagonal or a number")
             require_symmetric_psd(name, W)
@@ -77,16 +85,15 @@ class ClosedLoopLoss:
             require_finite(name, getattr(self, name))
         if self.limits is not None:
             require_kind("limits", self.limits, Box, Polytope)
-        if self.settling and self.band is None:
+        if _counts(self.settling) and self.band is None:
             fail("band", "is None", "Give the size (n,) of what counts as settled")
         if self.band is not None:
             require_real("band", self.band)
-            if not np.all(np.asarray(self.band) > 0):
+            if concrete(self.band) and not np.all(np.asarray(self.band) > 0):
                 fail("band", f"{self.band}", "Give positive numbers")
             if np.ndim(self.band) > 1:
                 fail("band", f"shape {np.shape(self.band)}", "Give (n,), one number for each state")
-        if not self.softness > 0:
-            fail("softness", f"{self.softness}", "Give a positive number")
+        number("softness", self.softness, np.finfo(np.float64).tiny, "Give a positive number")
 
     def __call__(self, run: Run) -> Array:
         """Return the loss of one run."""
@@ -114,9 +121,9 @@ class ClosedLoopLoss:
         e, v = x - r, run.inputs - (s[:T] if s.ndim == 2 else s)
         square = lambda v, W: jnp.sum(v * matmul(v, jnp.asarray(W, dtype)))
         terms = {"tracking": square(e[:-1], self.Q) / T, "effort": square(v, self.R) / T}
-        if self.limits is not None and self.violation:
+        if self.limits is not None and _counts(self.violation):
             terms["violation"] = self.violation * jnp.sum(self.excess(x)) / T
-        if self.settling:
+        if _counts(self.settling):
             d = jnp.max(jnp.abs(e[1:]) / jnp.asarray(self.band, dtype), axis=1)
             inside = jax.nn.log_sigmoid((1 - d) / self.softness)
             stays = jnp.exp(jnp.cumsum(inside[::-1])[::-1])

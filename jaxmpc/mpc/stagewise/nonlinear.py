@@ -13,7 +13,6 @@ Newton's, stage by stage: with the costates λ and the multipliers y of the func
 """
 
 import functools
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -21,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import DTypeLike
 
 from jaxmpc.checks import (
     concrete,
@@ -37,7 +37,7 @@ from jaxmpc.mpc.stagewise.stages import Stages, remembering
 from jaxmpc.pytrees import named_pytree, pytree, static
 from jaxmpc.qp.linalg import apply, apply_transposed, matmul, symmetric
 from jaxmpc.qp.problem import Bounds
-from jaxmpc.systems.given_model import as_argument, is_model
+from jaxmpc.systems.given_model import as_argument, closed, is_model
 from jaxmpc.systems.system import LinearSystem
 
 
@@ -50,7 +50,8 @@ class Task:
 
     function: one step of the model -> (p,) or a number, written in JAX, of what `model.view(x, u)`
         gives: for a robot mjx.Data with the poses and velocities of all bodies, for other models
-        a `Point` with x and u. A constant of compiled programs, told apart by identity.
+        a `Point` with x and u. The arrays of a pytree, such as an equinox module, are data of the
+        program, any other function is a constant of it, told apart by identity.
     weight: W, a number, (p,) for a diagonal or (p, p); None: no cost.
     target: (p,), or (N + 1, p) for each step; None: zero.
     lower, upper: (p,) or a number, ±inf or None for no limit.
@@ -59,7 +60,7 @@ class Task:
     name, unit: in tables.
     """
 
-    function: Callable[[Any], Any] = static()
+    function: Any
     weight: Any = None
     target: Any = None
     lower: Any = None
@@ -68,6 +69,10 @@ class Task:
     stages: tuple[int, ...] | None = static(default=None)
     name: str = static(default="task")
     unit: str = static(default="")
+
+    def __post_init__(self) -> None:
+        if callable(self.function):
+            object.__setattr__(self, "function", as_argument(self.function))
 
     @property
     def limited(self) -> bool:
@@ -172,7 +177,16 @@ class NonlinearMPC:
         """Return how many numbers the function of each task gives."""
         return [shape[0] for shape in self._shapes()[1]] if self.tasks else []
 
-    def _shapes(self) -> tuple[tuple[int, ...], list[tuple[int, ...]]]:
+    def closed(self, dtype: DTypeLike) -> "NonlinearMPC":
+        """Return the problem with the traced arrays that its functions close over as data; dtype:
+        of the states and inputs that they are called with."""
+        kind = lambda v: dtype if jnp.issubdtype(v.dtype, jnp.floating) else v.dtype
+        as_called = lambda v: jax.ShapeDtypeStruct(v.shape, kind(v))
+        x, u, view = jax.tree.map(as_called, self._shapes()[2])
+        tasks = [replace(task, function=closed(task.function, view)) for task in self.tasks]
+        return replace(self, model=closed(self.model, x, u), tasks=tuple(tasks))
+
+    def _shapes(self) -> tuple[tuple[int, ...], list[tuple[int, ...]], tuple]:
         leaves, tree = jax.tree.flatten(self)
         kind = lambda v: jax.dtypes.canonicalize_dtype(jnp.result_type(v))
         return _shapes(tree, tuple((np.shape(v), kind(v)) for v in leaves))
@@ -189,7 +203,7 @@ class NonlinearMPC:
             fail("model", f"is a {type(self.model).__name__}", "Give f(x, u) -> x⁺, or its object")
         if not isinstance(self.tasks, tuple) or not all(isinstance(t, Task) for t in self.tasks):
             fail("tasks", f"is a {type(self.tasks).__name__}", "Give a tuple of jm.mpc.Task")
-        after, values = self._shapes()
+        after, values, _ = self._shapes()
         if after != (self.mpc.system.n,):
             cure = f"Give the next state ({self.mpc.system.n},), as mpc.system has it"
             fail("model.step(x, u)", f"shape {after}", cure)
@@ -200,8 +214,11 @@ class NonlinearMPC:
 
     def value(self, task: Task, x: Array, u: Array) -> Array:
         """Return what the task's function gives at x, u, as a vector."""
-        view = getattr(self.model, "view", Point)
-        return jnp.atleast_1d(jnp.asarray(task.function(view(x, u)))).astype(x.dtype)
+        return jnp.atleast_1d(jnp.asarray(task.function(self.view(x, u)))).astype(x.dtype)
+
+    def view(self, x: Array, u: Array) -> Any:
+        """Return what tasks are functions of."""
+        return getattr(self.model, "view", Point)(x, u)
 
     def remembering(self) -> "NonlinearMPC":
         """Return the problem with a model of (x_k, u_{k−1}) where `Stages` have that state."""
@@ -241,18 +258,20 @@ class RememberingModel:
 
 
 @functools.lru_cache(maxsize=256)
-def _shapes(tree: Any, leaves: tuple) -> tuple[tuple[int, ...], list[tuple[int, ...]]]:
-    """Return the shapes of the next state and of what each task's function gives, for a problem
-    with this structure and these shapes and dtypes of its leaves."""
+def _shapes(tree: Any, leaves: tuple) -> tuple[tuple[int, ...], list[tuple[int, ...]], tuple]:
+    """Return the shapes of the next state and of what each task's function gives, and the types of
+    x, u and what tasks are functions of, for a problem with this structure and these shapes and
+    dtypes of its leaves."""
     abstract = tree.unflatten([jax.ShapeDtypeStruct(*leaf) for leaf in leaves])
     system = abstract.mpc.system
     x, u = (jax.ShapeDtypeStruct((size,), jnp.result_type(float)) for size in (system.n, system.m))
 
     def outputs(problem: NonlinearMPC, x: Array, u: Array) -> Any:
-        return problem.model.step(x, u), [problem.value(task, x, u) for task in problem.tasks]
+        values = [problem.value(task, x, u) for task in problem.tasks]
+        return problem.model.step(x, u), values, problem.view(x, u) if values else None
 
-    after, values = jax.eval_shape(outputs, abstract, x, u)
-    return after.shape, [value.shape for value in values]
+    after, values, view = jax.eval_shape(outputs, abstract, x, u)
+    return after.shape, [value.shape for value in values], (x, u, view)
 
 
 def weighed(weight: Any, v: Array) -> Array:

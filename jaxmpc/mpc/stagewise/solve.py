@@ -258,7 +258,7 @@ def read(
     pushed = minimise(s, gains, *s.pull(rho * E * (2 * p - t)))
     x, u = jax.tree.map(jnp.add, free, pushed)
     # A soft row that no input moves gets its penalty's gradient as multiplier: the gap closes.
-    y = jnp.where(E == 0, s.bounds.penalty_gradient(s.rows(x, u)), E * rho * (t - p))
+    y = jnp.where(E == 0, s.bounds.unmoved(E, s.rows(x, u)), E * rho * (t - p))
     return u, s.bounds.admissible(y)
 
 
@@ -329,6 +329,7 @@ def stage_solution(
         factor, *_ = given = jax.lax.stop_gradient(given)
         u, y, measured = searched(*given)
         u, y = implicit(stage_conditions, s, (factor.E, factor.rho[-1]), u, y)
+        y = s.bounds.following(y, factor.E, s.rows(predict(s, u), u))
     else:
         u, y, measured = searched(*given)
     none = Proof.none(u, y)
@@ -351,7 +352,7 @@ def searched(
         near = far(given) <= 100 * far((u, y))
         u, y = (jnp.where(near, v, 0.0) for v in given)
     rows = s.rows(predict(s, u), u)
-    fixed = jnp.where(E == 0, s.bounds.penalty_gradient(rows), 0.0)
+    fixed = s.bounds.unmoved(E, rows)
     if factor.gains is not None:
         bounds, v = s.bounds.scaled(E), E * rows
         t = v if warm_start is None else start(bounds, rho[0], v, scaled_multipliers(E, y))

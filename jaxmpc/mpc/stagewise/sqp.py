@@ -134,7 +134,7 @@ def solve_nonlinear(
         start = WarmStart(x, u, jnp.zeros(row_count(rows), s.P.dtype))
     else:
         start = WarmStart.of(warm_start, rows, mpc)
-    given = arrays((problem, solver, aim, start, scale))
+    given = arrays((problem.closed(s.P.dtype), solver, aim, start, scale))
     # About a plan the multipliers are known, of which the exact Hessian is made.
     known = warm_start is not None
     return _solve(*given, iterations=int(iterations), hessian=hessian, known=known)
@@ -223,6 +223,7 @@ def _solve(
         at_solution = jax.lax.stop_gradient((E, rho))
         z, y = implicit(nonlinear_conditions, (base, problem), at_solution, z, y)
         x, u = _states_inputs(s, z)
+        y = s.bounds.following(y, E, s.rows(x, u))
         found = assess(nonlinear_residuals, measured, u, y, Proof.none(u, y), eps)
         s = expanded(base, problem, x, u) if problem.tasks else s
     u = found.z
@@ -444,7 +445,7 @@ def sqp_step(most: int, hessian: str, constants: tuple, state: Iterate) -> Itera
         bent = curved(s, base, problem, x, u, costates(s, u, y), y)
         exact = state.exact & convex_with(bent, held(s, E, y))
         s = where_hessian(exact, bent, s)
-    fixed = jnp.where(E == 0, s.bounds.penalty_gradient(s.rows(x, u)), 0.0)
+    fixed = s.bounds.unmoved(E, s.rows(x, u))
     u_qp, y_qp, usable = precisely(solved_qp, s, E, rho, fixed, eps, u, y, exact)
     du, dy = u_qp - u, y_qp - y
 

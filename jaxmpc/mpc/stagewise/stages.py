@@ -347,11 +347,14 @@ def residuals_of(s: Stages, E: Array, u: Array, y: Array, found: Optimality) -> 
     """Return `stage_residuals` of a pair whose conditions are known.
 
     With the gradient g of the Lagrangian the gap z'Pz + q'z + g(Az) + g*(y) is
-    u'g + g(rows) + g*(y) − y'rows: at the optimum both parts are zero. What is typical of a row
-    and of an input is what is the most of the same one over the horizon. All that may vanish, as
-    where u = 0 is all that limits allow: inputs that cost as much as the plan, J ≤ ½ c, move a row
-    of scale E by up to √c/E, and steps that end at a limit of zero leave rounding of that. Another
-    limit is what its row is compared with, however far off the plan without it is.
+    u'g + g(rows) + g*(y) − y'rows: at the optimum both parts are zero. Its size is at most twice
+    what the plan costs: where the model is unstable, parts of g are larger by |A|^N.
+
+    What is typical of a row and of an input is what is the most of the same one over the horizon.
+    All that may vanish, as where u = 0 is all that limits allow: inputs that cost as much as the
+    plan, J ≤ ½ c, move a row of scale E by up to √c/E, and steps that end at a limit of zero leave
+    rounding of that. Another limit is what its row is compared with, however far off the plan
+    without it is.
     """
     bounds = s.bounds
     reach = jnp.where(E > 0, jnp.sqrt(2 * found.cost_terms) / jnp.where(E > 0, E, 1.0), 0.0)
@@ -363,6 +366,7 @@ def residuals_of(s: Stages, E: Array, u: Array, y: Array, found: Optimality) -> 
     terms = terms + jnp.sum(slopes * own_terms + jnp.abs(support))
     size = jnp.sum(penalty + jnp.abs(support) + jnp.abs(product))
     size = size + jnp.sum(jnp.abs(u) * found.gradient_size)
+    size = jnp.minimum(size, 2 * (found.cost_terms + jnp.sum(penalty)))
 
     def most(v: Array) -> Array:
         parts = split(s.layout, v)
