@@ -88,6 +88,10 @@ def grid_ends(
         )
         fail(f"{where}lower", "no finite range to map", cure)
     if np.any(low >= high):
+        if lower is None and upper is None:
+            i = int(np.argmax(low >= high))
+            cure = f"Give {where}lower and {where}upper, or map other axes"
+            fail(f"{where}lower", f"limits leave coordinate {i + 1} of {low.size} no range", cure)
         what = f"{low.tolist()} not below upper {high.tolist()}"
         fail(f"{where}lower", what, "Lower must be below upper")
     return low, high

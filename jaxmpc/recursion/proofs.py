@@ -294,7 +294,8 @@ def settle_by_regions(claims: Claims, max_regions: int, deadline: float = np.inf
     none = np.zeros((0, claims.problem.dimension))
     try:
         if mpc.input_in_state:
-            fail("mpc", "its law depends on the previous input", "They are not enumerated then")
+            what = "its law depends on the previous input, and on disturbances"
+            fail("mpc", what, "Regions of both are not compared with X_N")
         found = critical_regions(mpc, max_regions=max_regions, seconds=deadline - time.monotonic())
     except ValueError as error:
         return RegionVerdict.none(claims.problem.dimension, f"no critical regions ({error})")

@@ -8,12 +8,12 @@ that MuJoCo enforces by stiff springs (solref, solimp). Here they are exact, by 
 import numpy as np
 
 from jaxmpc.checks import fail
-from jaxmpc.robots.mujoco_access import equalities, mujoco, name_of
+from jaxmpc.robots.mujoco_access import equalities, mujoco, name_of, names
 
 # Steps of Newton's method, and the residual (rad, m) at which they end.
 _STEPS, _END = 50, 1e-12
 # The residual up to which a coupling counts as met.
-_MET = 1e-6
+MET = 1e-6
 # Directions of G smaller than this, relative to the largest, repeat others.
 _RANK = 1e-9
 
@@ -54,10 +54,17 @@ class Couplings:
             return ""
         residual = np.abs(self.rows(q)[0])
         worst = int(np.argmax(residual))
-        if residual[worst] <= _MET:
+        if residual[worst] <= MET:
             return ""
-        number = self.data.efc_id[worst]
-        return f"{name_of(self.model, 'equality', number)} is off by {residual[worst]:.3g}"
+        return f"{self.name(self.data.efc_id[worst])} is off by {residual[worst]:.3g}"
+
+    def name(self, i: int) -> str:
+        """Return the name of an equality, or where it has none the joints that it couples."""
+        model = self.model
+        if names(model, "equality")[i] or model.eq_type[i] != mujoco.mjtEq.mjEQ_JOINT:
+            return name_of(model, "equality", i)
+        ends = (model.eq_obj1id[i], model.eq_obj2id[i])
+        return "equality of " + " and ".join(name_of(model, "joint", k) for k in ends if k >= 0)
 
     def kept(self, states: np.ndarray) -> np.ndarray:
         """Return states (..., nq + nv + na) with the nearest configurations and velocities that

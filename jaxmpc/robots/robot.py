@@ -27,7 +27,7 @@ from jaxmpc.qp.jax_transformations import own_modes, varying
 from jaxmpc.qp.linalg import eigh, matmul
 from jaxmpc.robots.configurations import difference, quaternions, retract
 from jaxmpc.robots.contacts import standing_physics
-from jaxmpc.robots.couplings import Couplings
+from jaxmpc.robots.couplings import MET, Couplings
 from jaxmpc.robots.description import RobotDescription
 from jaxmpc.robots.equilibria import (
     inverse_actuation,
@@ -37,7 +37,7 @@ from jaxmpc.robots.equilibria import (
     rest_at,
     settled,
 )
-from jaxmpc.robots.mujoco_access import number_of
+from jaxmpc.robots.mujoco_access import equalities, number_of
 from jaxmpc.systems.system import LinearSystem
 
 
@@ -84,9 +84,11 @@ class Robot(RobotDescription):
         It is of the predictor, by automatic differentiation. exact=False: one physics step is
         linearised and its affine map applied `substeps` times (a tenth of the cost; on a 7-joint
         arm A is off by 1 %, B by 0.05 %). exact=True: Jacobians along the physics steps, and c such
-        that the model passes through the predictor's own next state. numbers: fields of mjx.Model
-        in place of the predictor's own, see `vary`.
+        that the model passes through the predictor's own next state. A robot with couplings always
+        gets this: their forces differ from one physics step to the next. numbers: fields of
+        mjx.Model in place of the predictor's own, see `vary`.
         """
+        exact = exact or bool(equalities(self.predictor.model))
         return _linearized(self, *self.checked_arrays(x, u), numbers or {}, exact=exact)
 
     def _linearize(self, x: Array, u: Array, numbers: dict[str, Any], exact: bool) -> LinearSystem:
@@ -145,13 +147,15 @@ class Robot(RobotDescription):
         """Return (x, u): the robot at rest in the configuration q (nq,), and the input that holds
         it.
 
-        q: None for that of `home`; (..., nq) for many. The input (or the activation, where an
+        q: None for that of `home`, moved to where the couplings are met; (..., nq) for many. The
+        input (or the activation, where an
         actuator has one) balances gravity and passive forces; where several do, the one of least
         squares, each input relative to half its range, or to what the load asks of it if that is
         less. Couplings carry what they can; their springs yield a little, so x lies next to q
-        there. near (nq,), in place of q: the configuration nearest to it that inputs within the
-        limits hold, inside the position limits: a local search, least squares of the forces and
-        of the motion. Limits' springs, contacts and dry friction do not help. Computed
+        there, and is taken for q too. near (nq,), in place of q: the configuration nearest to it
+        that inputs within the limits hold, inside the position limits: a local search, least
+        squares of the forces and of the motion. Limits' springs, contacts and dry friction do not
+        help. Computed
         outside JAX in float64 by MuJoCo's C engine.
 
         Raises ValueError where the actuators cannot hold q at all, or only beyond input_limits,
@@ -174,14 +178,15 @@ class Robot(RobotDescription):
                 fail("near", missing + lacking(self, rest), cure)
             require_rest("near", self, [rest])
             return rest.x, rest.u
-        return self._equilibria("q", self.home[: self.mujoco.nq] if q is None else q)
+        if q is None:
+            q = Couplings(self.predictor.model).met(self.home[: self.mujoco.nq])
+        return self._equilibria("q", q)
 
     def _equilibria(self, argument: str, q: Any) -> tuple[np.ndarray, np.ndarray]:
         """Return (x, u) of the robot at rest in q (..., nq), as `equilibrium`; errors name the
         argument that gave q."""
         q = self.configurations(argument, q)
-        self._require_coupled(argument, q)
-        rests = [rest_at(self, row) for row in q.reshape(-1, q.shape[-1])]
+        rests = [rest_at(self, self._coupled(argument, row)) for row in q.reshape(-1, q.shape[-1])]
         cure = "Choose a configuration that the actuators hold, or search for one: "
         cure += "robot.equilibrium(near=q)"
         if hasattr(self.predictor, "feet"):
@@ -200,16 +205,22 @@ class Robot(RobotDescription):
         x, u = (np.array([getattr(rest, name) for rest in rests]) for name in ("x", "u"))
         return x.reshape(*q.shape[:-1], self.state_size), u.reshape(*q.shape[:-1], self.m)
 
-    def _require_coupled(self, argument: str, q: np.ndarray) -> None:
-        """Raise ValueError where configurations (..., nq) violate couplings of the file."""
+    def _coupled(self, argument: str, q: np.ndarray) -> np.ndarray:
+        """Return the configuration (nq,) that meets the couplings of the file: q itself, or the
+        nearest one where q breaks them by at most twice what rest there does. ValueError else."""
         couplings = Couplings(self.predictor.model)
-        for row in q.reshape(-1, q.shape[-1]):
-            if off := couplings.unmet(row):
-                nearest = couplings.met(row)
-                cure = f"The nearest configuration that meets them: {nearest}"
-                if couplings.unmet(nearest):
-                    cure = "No configuration near it meets them: start elsewhere, or mend the file"
-                fail(argument, f"{row} violates couplings (equalities) of the file: {off}", cure)
+        off = couplings.unmet(q)
+        if not off:
+            return q
+        nearest = couplings.met(q)
+        cure = f"The nearest configuration that meets them: {nearest}"
+        if couplings.unmet(nearest):
+            cure = "No configuration near it meets them: start elsewhere, or mend the file"
+        else:
+            yields = couplings.rows(rest_at(self, nearest).x[: len(q)])[0]
+            if np.all(np.abs(couplings.rows(q)[0]) <= 2 * np.abs(yields) + MET):
+                return nearest
+        return fail(argument, f"{q} violates couplings (equalities) of the file: {off}", cure)
 
     def set_point(self, target: Any = None) -> tuple[np.ndarray, np.ndarray]:
         """Return (x, u), the state and the input about which `robot_mpc` takes its model.

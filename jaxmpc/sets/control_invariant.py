@@ -177,7 +177,10 @@ def _recursion(step: OneStep, X: Polytope, max_iterations: int, tolerance: float
             if k < max_iterations:
                 width = _width(following, whole)
                 if width <= FLAT:
-                    why = f"C_k converges to a set without volume (margin {width:.0e})"
+                    why = (
+                        f"C_{k + 1} is thinner than {FLAT:.0e} of the limits (margin {width:.0e}): "
+                        "the limit has no volume, or wants tighter limits of the states"
+                    )
                     return _End(C, k, why, cut=cut, flat=following)
                 C, last = following.require_body().reduce(), cut
     except ValueError as error:

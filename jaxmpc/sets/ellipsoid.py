@@ -150,7 +150,7 @@ class Ellipsoid(BasicSet):
         M, t = affine_map(M, t, (None, len(P)))
         L = np.linalg.solve(np.linalg.cholesky(P).T, np.eye(len(P)))  # x = center + L w
         root = M @ L
-        size = np.linalg.svd(root / np.linalg.norm(root, axis=1, keepdims=True), compute_uv=False)
+        size = np.linalg.svd(root / _lengths(root, 1), compute_uv=False)
         if len(M) > len(P) or not size[-1] > FLAT * size[0]:
             problem = f"has a rank below {len(M)}, so the image is flat, which no Ellipsoid is"
             fail("M", problem, "Map to fewer coordinates, or give a Zonotope")
@@ -159,12 +159,12 @@ class Ellipsoid(BasicSet):
 
     def preimage(self, M: Reals, t: Reals | None = None) -> "Ellipsoid":
         """Return {x : M x + t in the set}, M (n, k) of rank k; t (n,), or None for 0. ValueError
-        where it is unbounded, or empty."""
+        where it is unbounded, empty or a point."""
         P, level, center = self._values()
         M, t = affine_map(M, t, (len(P), None))
         U = np.linalg.cholesky(P).T
         root, offset = U @ M, U @ (center - t)
-        size = np.linalg.svd(root / np.linalg.norm(root, axis=0), compute_uv=False)
+        size = np.linalg.svd(root / _lengths(root, 0), compute_uv=False)
         if M.shape[1] > len(P) or not size[-1] > FLAT * size[0]:
             problem = f"has a rank below {M.shape[1]}, so the set is unbounded"
             fail("M", problem, "Give a matrix of full column rank")
@@ -172,12 +172,12 @@ class Ellipsoid(BasicSet):
         middle = np.linalg.lstsq(root, offset, rcond=None)[0]
         left = level - float(np.sum((root @ middle - offset) ** 2))
         if not left > 0:
-            fail("Ellipsoid", "is empty there: no Ellipsoid stands for that", "Use a Polytope")
+            fail("Ellipsoid", "is empty there, or a point, which no Ellipsoid is", "Use a Polytope")
         return Ellipsoid(root.T @ root, left, middle)
 
     def slice(self, values: Mapping[int, float]) -> "Ellipsoid":
         """Return the section with some coordinates fixed, {axis: value, ...}, in the others.
-        ValueError where it is empty."""
+        ValueError where it is empty, or a point."""
         n = self.dimension
         fixed, at, rest = section(values, n)
         t = np.zeros(n)
@@ -282,3 +282,9 @@ class Ellipsoid(BasicSet):
         require_shape(f"{argument}.level", as_array(self.level), (), "Give one number")
         if self.center is not None:
             require_shape(f"{argument}.center", self.center, shape[:1], "Give one entry a state")
+
+
+def _lengths(M: np.ndarray, axis: int) -> np.ndarray:
+    """Return the lengths of the rows (axis 1) or columns (0) of a matrix, 1 of those of zeros."""
+    length = np.linalg.norm(M, axis=axis, keepdims=True)
+    return np.where(length > 0, length, 1.0)

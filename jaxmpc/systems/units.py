@@ -18,6 +18,8 @@ from jaxmpc.qp.linalg import namespace
 # of 1e-16 one way and 1 the other way are of 1e-8 both ways.
 _ROUNDING = 2.0**-25
 _SWEEPS = 40
+# Parts of a sum that leave it as it is, and time steps within which inputs move states.
+_LOST, _STEPS = 2.0**-52, 10
 # Units are between 2^-_FARTHEST and its inverse.
 _FARTHEST = 100
 
@@ -60,6 +62,7 @@ def natural_units(A: Any, B: Any, Q: Any = None, R: Any = None) -> Units:
         A, B, Q, R = jax.lax.stop_gradient((A, B, Q, R))
     (n, m), dtype = B.shape, A.dtype
     others, B, itself = xp.abs(A) * (1 - np.eye(n)), xp.abs(B), xp.abs(xp.diagonal(A))
+    others = xp.where(_lost(xp, others, B), 0, others)
     roots = [
         xp.zeros(k, dtype) if W is None else xp.sqrt(xp.abs(xp.diagonal(W)))
         for W, k in ((Q, n), (R, m))
@@ -100,6 +103,17 @@ def natural_units(A: Any, B: Any, Q: Any = None, R: Any = None) -> Units:
     x, u, v = settled((kept, B * (b > _ROUNDING * rows[:, None])), logs)
     whole = lambda w: xp.ldexp(xp.ones_like(w), xp.round(w).astype(int))
     return Units(whole(x), whole(u), whole(2 * v))
+
+
+def _lost(xp: Any, A: Any, B: Any) -> Any:
+    """Return which entries (n, n) are lost to rounding, whatever the units: by which no input moves
+    a state by a part of what it moves it by otherwise. A, B are of absolute values."""
+    moved = B
+    for _ in range(min(len(A), _STEPS)):
+        moved = xp.maximum(moved, A @ moved)
+    reached = (moved > 0).any(axis=1)
+    through = A[:, :, None] * moved[None]
+    return reached[:, None] & reached & (through <= _LOST * moved[:, None]).all(axis=2)
 
 
 def less_identity(A: np.ndarray) -> np.ndarray:

@@ -171,10 +171,18 @@ def _at(mpc: MPC, name: str) -> np.ndarray:
     """Return what lies at a name in the problem; ValueError where there is nothing."""
     known = 'such as "Q", "R", "P", "A", "B", "c", "inputs.upper"'
     *parts, last = _path(name)
+    part: Any = mpc
     try:
         part = reduce(getattr, parts, mpc)
         value = getattr(part, last)
     except AttributeError:
+        if part is None and hasattr(mpc, parts[0]):
+            whole = ".".join(parts)
+            fail(
+                "learn",
+                f"{whole!r} is None in the problem",
+                f"Give it, with {last!r} to start from",
+            )
         fail("learn", f"{name!r} is no field of the problem", f"Give names {known}")
     field = getattr(part, "__dataclass_fields__", {}).get(last)
     if field is None:  # a property, or an attribute of an array

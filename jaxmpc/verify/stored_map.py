@@ -92,6 +92,8 @@ def verify_map(
         result = Verification({}, problems=list(found.problems))
         if not found.whole:
             return result
+        if found.attributes.get("problem", {}) is None:
+            return _of_unstored_policies(found, result)
         try:
             if _count(found, result):
                 if report:
@@ -122,6 +124,19 @@ def find_store(path: str | Path) -> str | Path:
         what = f"holds {' and '.join(v.name for v in inside)}" if inside else "holds no labels"
         fail(str(path), what, "Give the folder of a sweep or a recursion report, or what it holds")
     return inside[0]
+
+
+def _of_unstored_policies(found: Stored, result: Verification) -> Verification:
+    """Return the result for a report about policies of several sequences of inputs, which keeps no
+    problem: what it says of states cannot be proved again."""
+    label = found.arrays["label"]
+    result.labels = {name: int(np.sum(label == value)) for value, name in NAMES.items()}
+    worst = found.attributes["summary"].get("counterexample")
+    told = {"labels": np.any(label != 0), "a counterexample": worst is not None}
+    for what in (name for name, there in told.items() if there):
+        policy = "policies of several sequences of inputs"
+        result.problems.append(f"holds {what} of {policy}, which cannot be proved again")
+    return result
 
 
 def _count(found: Stored, result: Verification) -> bool:
@@ -417,8 +432,12 @@ def read_report(path: Path, check: Check = lambda attributes, axes: []) -> Store
     record, arrays = found
     try:
         summary, wrong = read_results(path.parent / "summary.json")
-        shapes = {name: (1, *tail) for name, tail in label_shapes(record).items()}
-        n, m = np.shape(record["problem"]["B"])
+        if record["problem"] is None:
+            n, m = (arrays[name].shape[1] for name in ("state", "input"))
+            shapes = dict[str, tuple[int, ...]]()
+        else:
+            shapes = {name: (1, *tail) for name, tail in label_shapes(record).items()}
+            n, m = np.shape(record["problem"]["B"])
     except (ValueError, LookupError, TypeError) as error:
         return Stored.damaged(f"{path.name}, summary.json: {error}")
     count = len(arrays["label"]) if "label" in arrays and arrays["label"].ndim == 1 else -1
@@ -438,7 +457,7 @@ def read_report(path: Path, check: Check = lambda attributes, axes: []) -> Store
         if not isinstance(stated, dict) or stated.get(name) != int(np.sum(flags)):
             problems.append(f"summary.json: its count {name!r} is not {int(np.sum(flags)):,}")
     attributes = {**record, "summary": summary, "config": summary.get("config")}
-    if differing := check(attributes, {}):
+    if record["problem"] is not None and (differing := check(attributes, {})):
         return Stored(attributes, {}, {}, 0, 0, [*problems, *differing], False)
     arrays["points"] = arrays["state"]
     return Stored(attributes, arrays, {"sample": arrays["state"]}, 1, 1, problems)

@@ -196,7 +196,8 @@ def _error_message(error: ValidationError, whole: Any) -> str:
     if first["type"] == unknown:
         return _unknown_key(where, whole)
     if first["type"] == "missing":
-        return f"{key} is missing. Add it (jaxmpc sweep --help lists all keys)"
+        none = ", inf where there is none" if where[0] == "limits" else ""
+        return f"{key} is missing. Add it{none} (jaxmpc sweep --help lists all keys)"
     if first["type"] == "dataclass_type":
         return f"{key}: is no section. Write [{key}] above its keys"
     if where == ["outputs"] and first["type"] == "tuple_type":

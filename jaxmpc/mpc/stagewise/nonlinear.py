@@ -110,6 +110,9 @@ class Task:
             values = np.asarray(self.weight, float)
             values = np.diag(values) if values.ndim == 1 else np.atleast_2d(values)
             require_symmetric_psd(f"{name}.weight", values)
+        if self.target is not None and self.weight is None:
+            cure = "Give weight= for a cost, or lower= and upper= for limits"
+            fail(f"{name}.target", "is given without a weight", cure)
         if self.rho is not None and concrete(self.rho) and not float(self.rho) >= 0:
             fail(f"{name}.rho", f"{self.rho}", "Give at least 0, or None for hard limits")
         if self.limited and concrete(self.lower, self.upper):
@@ -270,7 +273,12 @@ def _shapes(tree: Any, leaves: tuple) -> tuple[tuple[int, ...], list[tuple[int, 
         values = [problem.value(task, x, u) for task in problem.tasks]
         return problem.model.step(x, u), values, problem.view(x, u) if values else None
 
-    after, values, view = jax.eval_shape(outputs, abstract, x, u)
+    try:
+        after, values, view = jax.eval_shape(outputs, abstract, x, u)
+    except jax.errors.JAXTypeError as error:
+        what = f"is not written in JAX ({str(error).splitlines()[0]})"
+        cure = "Use jax.numpy in place of numpy, and jnp.where or jax.lax.cond in place of if"
+        fail("model or task", what, cure)
     return after.shape, [value.shape for value in values], (x, u, view)
 
 
