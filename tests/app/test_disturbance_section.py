@@ -215,6 +215,19 @@ def test_sweep_and_verify_commands(tmp_path, monkeypatch, capsys, policy):
     assert counts["feasible"] > 250 and counts["infeasible"] > 90
 
 
+@pytest.mark.parametrize("policy", ["affine", "tube"])
+@pytest.mark.first(1)
+def test_a_report_about_policies_is_no_damaged_one(tmp_path, monkeypatch, capsys, policy):
+    """It keeps no problem of theirs, and says nothing of single states that could be proved."""
+    monkeypatch.chdir(tmp_path)
+    text = TEXT.replace("[disturbance]", f'[disturbance]\npolicy = "{policy}"')
+    (tmp_path / "problem.toml").write_text(text.replace("horizon = 5", "horizon = 2"))
+    assert main("recursion --config problem.toml --output out".split()) in (0, None)
+    capsys.readouterr()
+    assert main(["verify", "out"]) == 0
+    assert "nothing to verify, no state is labelled" in capsys.readouterr().out
+
+
 def test_a_sweep_that_is_refused_leaves_nothing(tmp_path, monkeypatch, capsys):
     """No folder is made before the problem is found to have labels."""
     monkeypatch.chdir(tmp_path)

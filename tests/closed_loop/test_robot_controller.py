@@ -4,6 +4,7 @@ from functools import cache
 
 import cvxpy as cp
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
@@ -362,6 +363,19 @@ def test_bad_problems_and_controllers_are_named(pendulum, linear_mpc):
     ):
         with pytest.raises(ValueError, match=message):
             call()
+
+
+def test_a_problem_of_traced_weights_is_that_of_their_values(pendulum):
+    """Inside jit too, where the model of the robot is made from what is known."""
+
+    def cost_to_go(scale):
+        return jm.robot_mpc(pendulum, scale * jnp.array([4.0, 0.1]), [0.01], 4).terminal_cost
+
+    with jax.enable_x64(True):
+        found, slope = jax.jit(lambda s: jax.jvp(cost_to_go, (s,), (1.0,)))(2.0)
+        wanted = [cost_to_go(s) for s in (2.0, 2 + 1e-4, 2 - 1e-4)]
+    np.testing.assert_allclose(found, wanted[0], rtol=1e-9)
+    np.testing.assert_allclose(slope, (wanted[1] - wanted[2]) / 2e-4, rtol=1e-6)
 
 
 def test_margin_gives_way_to_the_target():

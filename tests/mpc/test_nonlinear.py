@@ -405,6 +405,14 @@ BAD = {
         lambda p: solve_nonlinear(replace(p, model=lambda x, u: jnp.zeros(3)), START),
         r"model.step\(x, u\): shape \(3,\)",
     ),
+    "no weight": (
+        lambda p: solve_nonlinear(replace(p, tasks=(Task(squared, target=2.0),)), START),
+        "task.target: is given without a weight",
+    ),
+    "numpy": (
+        lambda p: solve_nonlinear(replace(p, model=lambda x, u: np.array([x[0], u[0]])), START),
+        "model or task: is not written in JAX",
+    ),
     "tasks": (lambda p: solve_nonlinear(replace(p, tasks=(3,)), START), "tasks: is a tuple"),
     "problem": (lambda p: solve_nonlinear(p.mpc, START), "problem: is a MPC"),
 }  # fmt: skip
@@ -415,6 +423,40 @@ def test_bad_arguments(name, x64):
     call, text = BAD[name]
     with pytest.raises(ValueError, match=text):
         call(around())
+
+
+class Distance:
+    """The squared distance from a point: a function whose number is data."""
+
+    def __init__(self, center):
+        self.center = center
+
+    def __call__(self, at):
+        return (at.x - self.center) @ (at.x - self.center)
+
+
+jax.tree_util.register_pytree_node(
+    Distance, lambda d: ((d.center,), None), lambda _, leaves: Distance(*leaves)
+)
+
+
+def test_functions_may_close_over_what_is_differentiated(x64):
+    """A model and a task that are functions of traced numbers, and a task that is a pytree."""
+    mpc = replace(around(steps=3).mpc, states=None)
+
+    def cost(p, function):
+        model = lambda x, u: bent(x, u) + 0.1 * p[0] * jnp.sin(x)
+        task = Task(function(p[1]), weight=1.0, target=0.5)
+        return solve_nonlinear(NonlinearMPC(mpc, model, (task,)), START).cost
+
+    written = lambda r: lambda at: (at.x - r) @ (at.x - r)
+    p, h = jnp.array([0.7, 0.2]), 1e-5
+    found = jax.jit(jax.value_and_grad(lambda p: cost(p, written)))(p)
+    other = jax.jit(jax.value_and_grad(lambda p: cost(p, Distance)))(p)
+    jax.tree.map(lambda v, w: np.testing.assert_allclose(v, w, rtol=1e-9), found, other)
+    value = jax.jit(lambda p: cost(p, Distance))
+    slopes = [(value(p + h * e) - value(p - h * e)) / (2 * h) for e in np.eye(2)]
+    np.testing.assert_allclose(found[1], slopes, rtol=1e-6)
 
 
 def tip(at):

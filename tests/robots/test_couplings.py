@@ -115,6 +115,29 @@ def test_random_starts_meet_the_couplings():
     np.testing.assert_allclose(starts[:, 5], 0.5 * starts[:, 3], atol=1e-5)
 
 
+def test_the_default_model_off_the_couplings_is_that_of_a_period():
+    """Where they are off, as in closed loops, their forces differ from one physics step to the
+    next: one step's model taken several times had a radius of 2.8 in place of 1.03."""
+    robot = coupled("joint")
+    x, u = np.array([0.3, -0.2, 0.18, 0.5, -0.3, 0.5]), np.array([1.0, -0.5])
+    with jax.enable_x64(True):
+        model = robot.linearize(x, u)
+        after = np.asarray(robot.step(x, u))
+        h, eye = 1e-6, np.eye(6)
+        slopes = [(robot.step(x + h * e, u) - robot.step(x - h * e, u)) / (2 * h) for e in eye]
+    A, B, c = map(np.asarray, (model.A, model.B, model.c))
+    np.testing.assert_allclose(A @ x + B @ u + c, after, atol=1e-9)
+    np.testing.assert_allclose(A, np.stack(slopes, 1), atol=1e-3 * np.abs(A).max())
+
+
+def test_where_it_rests_is_a_target():
+    robot = coupled("joint")
+    x, u = robot.equilibrium([0.3, -0.2, 0.5 * 0.3 + 0.3 * 0.3**2])
+    again = robot.equilibrium(x[:3])
+    np.testing.assert_allclose(again[0], x, atol=1e-3)
+    np.testing.assert_allclose(again[1], u, atol=1e-2)
+
+
 def test_a_target_off_the_couplings_is_refused_and_its_cure_helps():
     robot = coupled("joint")
     with pytest.raises(ValueError, match="q: .* violates couplings .* off by 0.2") as refusal:

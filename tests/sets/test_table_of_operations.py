@@ -368,6 +368,8 @@ def test_ellipsoids_by_closed_forms():
         (lambda E: Box([-1, -1], [1, 1]) & E, "other: Ellipsoid is no Box or Polytope"),
         (lambda E: np.ones((2, 2)) @ E, "M: has a rank below 2, so the image is flat"),
         (lambda E: E @ np.ones((2, 2)), "M: has a rank below 2, so the set is unbounded"),
+        (lambda E: np.diag([1.0, 0.0]) @ E, "M: has a rank below 2, so the image is flat"),
+        (lambda E: E @ np.diag([1.0, 0.0]), "M: has a rank below 2, so the set is unbounded"),
         (lambda E: E.slice({0: 3.0}), "Ellipsoid: is empty there"),
         (lambda E: E.slice({0: 0.0, 1: 0.0}), "values: fixes every coordinate"),
         (lambda E: E.slice({2: 0.0}), "axes: .* are not distinct numbers in 0..1"),

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from jaxmpc import LinearSystem, lqr
-from jaxmpc.systems.riccati import cost_of_law
+from jaxmpc.systems.riccati import cost_of_law, least_reached
+from jaxmpc.systems.units import natural_units
 
 # A robot joint (inertia 0.05, 10 ms) and the double integrator of MPT3's test suite, with
 # O_inf of their LQR from an exact rational recursion.
@@ -21,6 +22,17 @@ def riccati_residual(system, Q, R, P):
     A, B = np.asarray(system.A, float), np.asarray(system.B, float)
     S = R + B.T @ P @ B
     return A.T @ P @ A - A.T @ P @ B @ np.linalg.solve(S, B.T @ P @ A) + Q - P
+
+
+def test_rounding_of_derivatives_moves_no_unit():
+    """An arm that feels no gravity: its A has entries of 1e-35 where there is nothing, by which
+    the states alone act on each other. Inputs move all of it."""
+    noise = 1e-35 * np.random.default_rng(0).normal(size=(4, 4))
+    A = np.block([[np.eye(2), 0.01 * np.eye(2)], [np.zeros((2, 2)), np.eye(2)]]) + noise
+    B = np.array([[2e-4, -6e-4], [-6e-4, 8e-2], [4e-2, -0.1], [-0.1, 13.0]])
+    units = natural_units(A, B)
+    np.testing.assert_array_equal(units.states, natural_units(A - noise, B).states)
+    assert least_reached(A, B)[0] > 1e-3
 
 
 def test_lqr_of_the_joint():

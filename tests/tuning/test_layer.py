@@ -192,6 +192,7 @@ def test_a_closed_loop_carries_its_plans(layer, lesson, start, x64):
     [
         ("q", "'q' is no field"),
         ("c", "'c' is None in the problem"),
+        ("terminal_set.level", "'terminal_set' is None in the problem"),
         ("states", "'states' is a Box in the problem"),
         ("horizon", "'horizon' is a constant of the problem"),
         ("constrain_initial", "'constrain_initial' is a constant of the problem"),

@@ -412,6 +412,19 @@ def test_bad_losses(more, message):
         ClosedLoopLoss(**{"Q": [1.0, 1.0], "R": [1.0], **more})(run)
 
 
+def test_a_loss_has_derivatives_with_respect_to_its_weights(x64):
+    """The weights of a loss are sums over the run, whatever knows them: here a trace."""
+    run = run_of(np.array([[1.0, 2.0], [0.5, -1.0], [0.0, 3.0]]), np.array([[1.0], [-2.0]]))
+    limits = jm.Box([-2.0, -2.0], [2.0, 2.0])
+
+    def loss(q, r, violation):
+        return ClosedLoopLoss(q, r, limits=limits, violation=violation)(run)
+
+    found = jax.jit(jax.grad(loss, (0, 1, 2)))(jnp.array([1.0, 2.0]), jnp.array([0.1]), 3.0)
+    wanted = [(1 + 0.25) / 2, (4 + 1) / 2], [(1 + 4) / 2], 0.5 / 2
+    jax.tree.map(np.testing.assert_allclose, found, tuple(map(np.asarray, wanted)))
+
+
 def test_a_loss_is_of_one_loop():
     run = run_of(jnp.zeros((5, 4, 2)), jnp.zeros((5, 3, 1)))
     with pytest.raises(ValueError, match=r"run: has inputs of shape \(5, 3, 1\). Give one"):
