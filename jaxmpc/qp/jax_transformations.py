@@ -321,6 +321,19 @@ def batched_by(rule: Callable[..., R], function: Callable[..., R]) -> Callable[.
     return call
 
 
+def kept_whole(function: Callable[..., R]) -> Callable[..., R]:
+    """Return a function that has rules of derivatives, as one which keeps them.
+
+    Where a loop is linearised, as for reverse mode, JAX below 0.12 forgets the rules of what it
+    computes before: derivatives of these derivatives would be those of the function as written."""
+
+    def rule(size: int, in_batched: tuple, *arguments: Any) -> R:
+        axes = jax.tree.map(lambda b: 0 if b else None, in_batched)
+        return jax.vmap(function, in_axes=axes, axis_size=size)(*arguments)
+
+    return batched_by(rule, function)
+
+
 def in_blocks(
     function: Callable[[C, S], R],
     constants: C,
@@ -595,7 +608,7 @@ def implicit(
 def _implicit_jvp(conditions_of: Conditions, primals: tuple, tangents: tuple) -> tuple:
     data, constants, z, y = primals
     # As a result of this function, z and y carry the derivatives that higher orders need.
-    z, y = implicit(conditions_of, data, constants, z, y)
+    z, y = kept_whole(partial(implicit, conditions_of))(data, constants, z, y)
 
     def moved(data: Any, constants: Any, z: Array, y: Array, change: Any) -> tuple[Array, Array]:
         sound = all_finite((z, y))
