@@ -25,7 +25,7 @@ from jaxmpc.checks import concrete, fail, require_real, require_shape, whole
 from jaxmpc.mpc.condense import Condensed, condense
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp import linalg
-from jaxmpc.qp.jax_transformations import own_modes, varying
+from jaxmpc.qp.jax_transformations import kept_whole, own_modes, varying
 from jaxmpc.qp.linalg import arrays, matmul
 from jaxmpc.qp.newton import Augmented, Constants, gram, newton_step, ridged
 from jaxmpc.qp.problem import Bounds
@@ -152,7 +152,7 @@ def _(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     n = len(z)
     ridge = jnp.finfo(z.dtype).eps ** (2 / 3) * (1 + jnp.trace(K) / n)
     dz = -linalg.solve(K + ridge * jnp.eye(n, dtype=z.dtype), tangents[1])
-    return _following(z, gradient, K), dz
+    return kept_whole(_following)(z, gradient, K), dz
 
 
 def nearest_point(A: Array, bounds: Bounds, w: Array, steps: int) -> tuple[Array, Array]:

@@ -12,7 +12,7 @@ from jax import Array
 from jaxmpc.arrays import Reals, as_weight, host_array
 from jaxmpc.checks import concrete, fail, require_kind, require_shape, require_symmetric_psd
 from jaxmpc.pytrees import pytree
-from jaxmpc.qp.jax_transformations import own_modes, varying
+from jaxmpc.qp.jax_transformations import kept_whole, own_modes, varying
 from jaxmpc.qp.linalg import arrays, floating_dtype, in_float64, matmul, solve, solve_general
 from jaxmpc.systems.system import LinearSystem
 from jaxmpc.systems.units import natural_units
@@ -204,7 +204,7 @@ def _solution(A: Array, B: Array, Q: Array, R: Array) -> Array:
 def _solution_jvp(data: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple[Array, Array]:
     A, B, Q, R = data
     dA, dB, dQ, dR = tangents
-    P = _solution(A, B, Q, R)
+    P = kept_whole(_solution)(A, B, Q, R)
     K = _traced_gain(A, B, R, P)
     closed = A + matmul(B, K)
     F = matmul(matmul(closed.T, P), dA + matmul(dB, K))
