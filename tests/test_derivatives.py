@@ -153,8 +153,11 @@ def program(m):
 
 
 def learned(m):
-    layer = MPCLayer(problem(lambda v: np.asarray(v, float)), learn=("Q", "R", "A", "inputs.upper"))
-    theta = jax.tree.map(lambda v: m(np.asarray(v) + 0.1), layer.init())
+    with jax.ensure_compile_time_eval():
+        given = problem(lambda v: np.asarray(v, float))
+        layer = MPCLayer(given, learn=("Q", "R", "A", "inputs.upper"))
+        first = jax.tree.map(np.asarray, layer.init())
+    theta = jax.tree.map(lambda v: m(v + 0.1), first)
     return found(layer(theta, m(AT)).plan)
 
 
@@ -187,6 +190,8 @@ TASKS = {
     "limit": lambda m: (task(m, lower=m([0.5]), upper=m([0.9]), rho=m(0.2)),),
 }
 CASES = {
+    "lqr": law,
+    "qp": lambda m: jm.solve_qp(program(m)).z,
     "affine in a loop": loop(
         lambda m: jm.Controller(problem(m, horizon=2, **ROBUST["affine"](m))), 1, start=[0.6, -0.2]
     ),
@@ -219,9 +224,7 @@ CASES = {
     "loop, filter": filtered,
     "loop, feedback": loop(lambda m: LinearFeedback(problem(m), m([[-1.0, -1.5]]))),
     "loss": loss,
-    "lqr": law,
     "fraction": fraction,
-    "qp": lambda m: jm.solve_qp(program(m)).z,
     "margin": lambda m: feasibility_margin(replace(program(m), q=jnp.zeros(2)))[0],
     "layer": learned,
 }

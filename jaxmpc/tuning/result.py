@@ -102,7 +102,7 @@ class TuningRun:
         loss = number(self.before["loss"]), number(self.after["loss"])
         rows = [("loss", *loss, f"{words}{best}")]
         for name in self.values:
-            note = "never moved: no derivative" if name in self.unmoved else ""
+            note = "never moved: not trained, or no derivative" if name in self.unmoved else ""
             rows.append((name, _few(self.initial[name]), _few(self.values[name]), note))
         others = [name for name in self.before if name != "loss"]
         rows += [(k, number(self.before[k]), number(self.after.get(k, np.nan)), "") for k in others]

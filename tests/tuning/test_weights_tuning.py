@@ -95,7 +95,7 @@ def test_a_run_prints_what_changed(tuned):
     values = {**tuned.values, "rho": np.array(10.0)}
     run = replace(tuned, values=values, initial=values, trace=still)
     assert run.unmoved == ["rho"] and tuned.unmoved == []
-    assert "rho          10. -> 10.  (never moved: no derivative)" in repr(run)
+    assert "rho          10. -> 10.  (never moved: not trained, or no derivative)" in repr(run)
 
 
 def test_losses_that_cannot_be_traced_are_named(x64):
