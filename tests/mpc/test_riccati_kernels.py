@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jaxmpc as jm
+from jaxmpc.mpc import solve_nonlinear
 from jaxmpc.mpc.stagewise import recursion_kernels as kernels
 
 
@@ -209,6 +211,17 @@ def test_a_kernel_is_chosen_on_gpus_only(monkeypatch):
     assert jax.grad(lambda v: kernels._or_kernel(scan, kernel, v)[0])(one) == 6
     assert calls == [] or set(calls) == {(1,)}
     assert kernels._or_kernel(scan, kernel, one) == 9 and calls
+
+
+def test_nonlinear_plans_are_differentiated_backward_through_kernels(monkeypatch):
+    """A kernel has no transpose: what is linear in tangents is a derivative of itself. Traced."""
+    monkeypatch.setattr(kernels, "on_gpu", lambda: True)
+    mpc = jm.MPC(jm.LinearSystem(np.eye(2), np.ones((2, 1))), [1.0, 1.0], [1.0], 3)
+    model = lambda x, u: jnp.stack([x[0] + 0.1 * x[1], x[1] + 0.1 * u[0] + 0.1 * jnp.sin(x[0])])
+    cost = lambda x: solve_nonlinear(jm.NonlinearMPC(mpc, model), x).cost
+    with jax.enable_x64(True):
+        text = str(jax.make_jaxpr(jax.grad(cost))(jnp.array([0.5, 0.2])))
+    assert "gpu_kernel" in text
 
 
 def test_derivatives_under_vmap_and_jit(monkeypatch):

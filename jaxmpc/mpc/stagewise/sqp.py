@@ -396,7 +396,9 @@ def nonlinear_conditions(
 
     def undo_all(moved: tuple[Array, Array]) -> tuple[Array, Array]:
         du, dy = undo(moved[0])
-        dx = recurrence(s.A, apply(s.B, du), jnp.zeros_like(x[0]))
+        follow = lambda du: recurrence(s.A, apply(s.B, du), jnp.zeros_like(x[0]))
+        # Linear; as a derivative of itself it can be transposed, kernels or not.
+        dx = jax.jvp(follow, (jnp.zeros_like(du),), (du,))[1]
         dx = moved[1] + jnp.pad(dx, ((1, 0), (0, 0)))
         return jnp.concatenate([dx.ravel(), du.ravel()]), dy
 
