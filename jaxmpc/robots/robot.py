@@ -186,7 +186,8 @@ class Robot(RobotDescription):
         """Return (x, u) of the robot at rest in q (..., nq), as `equilibrium`; errors name the
         argument that gave q."""
         q = self.configurations(argument, q)
-        rests = [rest_at(self, self._coupled(argument, row)) for row in q.reshape(-1, q.shape[-1])]
+        rows, couplings = q.reshape(-1, q.shape[-1]), Couplings(self.predictor.model)
+        rests = [rest_at(self, self._coupled(argument, row, couplings)) for row in rows]
         cure = "Choose a configuration that the actuators hold, or search for one: "
         cure += "robot.equilibrium(near=q)"
         if hasattr(self.predictor, "feet"):
@@ -205,10 +206,9 @@ class Robot(RobotDescription):
         x, u = (np.array([getattr(rest, name) for rest in rests]) for name in ("x", "u"))
         return x.reshape(*q.shape[:-1], self.state_size), u.reshape(*q.shape[:-1], self.m)
 
-    def _coupled(self, argument: str, q: np.ndarray) -> np.ndarray:
+    def _coupled(self, argument: str, q: np.ndarray, couplings: Couplings) -> np.ndarray:
         """Return the configuration (nq,) that meets the couplings of the file: q itself, or the
         nearest one where q breaks them by at most twice what rest there does. ValueError else."""
-        couplings = Couplings(self.predictor.model)
         off = couplings.unmet(q)
         if not off:
             return q

@@ -92,12 +92,17 @@ class ClosedFunction:
     step = __call__
 
 
+def may_close_over(model: Any) -> bool:
+    """Return whether this is what `as_argument` made of a function."""
+    return isinstance(model, GivenModel) and isinstance(model.constant.given, FunctionType)
+
+
 def closed(model: Any, *examples: Any) -> Any:
     """Return what `as_argument` made of a function, with the traced arrays that the function closes
     over as data. Loops and rules of derivatives take such arrays as arguments alone.
 
     examples: of its arguments, arrays or their types."""
-    if not isinstance(model, GivenModel) or not isinstance(model.constant.given, FunctionType):
+    if not may_close_over(model):
         return model
     function, numbers = jax.closure_convert(model.constant.given, *examples)
     return ClosedFunction(tuple(numbers), function) if numbers else model

@@ -37,7 +37,7 @@ from jaxmpc.mpc.stagewise.stages import Stages, remembering
 from jaxmpc.pytrees import named_pytree, pytree, static
 from jaxmpc.qp.linalg import apply, apply_transposed, matmul, symmetric
 from jaxmpc.qp.problem import Bounds
-from jaxmpc.systems.given_model import as_argument, closed, is_model
+from jaxmpc.systems.given_model import as_argument, closed, is_model, may_close_over
 from jaxmpc.systems.system import LinearSystem
 
 
@@ -183,6 +183,8 @@ class NonlinearMPC:
     def closed(self, dtype: DTypeLike) -> "NonlinearMPC":
         """Return the problem with the traced arrays that its functions close over as data; dtype:
         of the states and inputs that they are called with."""
+        if not any(map(may_close_over, (self.model, *(task.function for task in self.tasks)))):
+            return self
         kind = lambda v: dtype if jnp.issubdtype(v.dtype, jnp.floating) else v.dtype
         as_called = lambda v: jax.ShapeDtypeStruct(v.shape, kind(v))
         x, u, view = jax.tree.map(as_called, self._shapes()[2])

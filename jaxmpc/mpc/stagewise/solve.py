@@ -258,7 +258,7 @@ def read(
     pushed = minimise(s, gains, *s.pull(rho * E * (2 * p - t)))
     x, u = jax.tree.map(jnp.add, free, pushed)
     # A soft row that no input moves gets its penalty's gradient as multiplier: the gap closes.
-    y = jnp.where(E == 0, s.bounds.unmoved(E, s.rows(x, u)), E * rho * (t - p))
+    y = jnp.where(E == 0, s.bounds.penalty_gradient(s.rows(x, u)), E * rho * (t - p))
     return u, s.bounds.admissible(y)
 
 
