@@ -65,6 +65,8 @@ LINE_STEPS, LINE_STEPS_SOFT = 6, 24
 SIGMA = 1.0
 # Steps without gain after which a pair within the tolerance is not made better any more.
 IDLE = 40
+# Steps without gain after which more of them are said to gain nothing, where so many are asked for.
+LEAST_IDLE = 200
 
 
 class Constants(NamedTuple):
@@ -372,7 +374,7 @@ def improve(
     The method of multipliers takes what steps on the dual do not solve: P singular, balls,
     degenerate or infeasible rows.
     Returns the best pair and what is proved, whether there is nothing left to try, and whether the
-    last half of many steps have not made the pair better.
+    last half of many steps, 200 at least, have not made the pair better.
     """
     qp, f, false = p.qp, p.factor, jnp.asarray(False)
     best, go_on = Pair.none(p.q, p.bounds.l), ~false
@@ -416,7 +418,7 @@ def improve(
         s = repeat_while(lambda s: s.open, partial(advance, most), given, s, "long", work=work)
         if has_dual_steps(qp.balls, qp.A):
             s = replace(s, best=corrected_end(p, s))
-    return s.best, s.proof, ~false, s.idle > max(most // 2, 50)
+    return s.best, s.proof, ~false, s.idle > max(most // 2, LEAST_IDLE)
 
 
 def corrected_end(p: ScaledProgram, s: Refinement) -> Pair:
@@ -457,7 +459,7 @@ def advance(most: int, given: RefinementData, s: Refinement) -> Refinement:
     proof = s.proof.joined(proved)
     # Where there is no answer, the best is the point of least violation, at which this ends.
     best = tree_where(primal, s.best.or_better(pair), s.best)
-    idle = jnp.where(best.error < 0.5 * s.best.error, 0, s.idle + 1)
+    idle = jnp.where(best.error < 0.5 * s.best.error, 0, s.idle + primal)
     best = tree_where(proof.beyond & ~best.finished, pair, best)
     steps, left = s.steps + primal, s.left - 1
     new = replace(s, point=point, q=q, best=best, steps=steps, idle=idle, proof=proof, left=left)

@@ -11,8 +11,8 @@ from jaxmpc.pytrees import short_text, short_value
 
 class Status(IntEnum):
     """Outcome of one QP, or label of one state of a map. 1 to 9 are OSQP's numbers; 0 marks
-    instances that have not been solved yet. ITERATION_LIMIT: all steps were taken, and the last
-    ones still gained; INACCURATE: steps were left or gained nothing more, and the tolerance is not
+    instances that have not been solved yet. ITERATION_LIMIT: all steps were taken, and more
+    might have gained; INACCURATE: steps were left or gained nothing more, and the tolerance is not
     met.
 
     A status is derived from residuals and certificates that are computed in the units of
@@ -99,7 +99,7 @@ _SENTENCES = {
         "Add a cost or a bound on that ray."
     ),
     Status.ITERATION_LIMIT: (
-        "Neither solved nor proved infeasible within all steps, the last of which still gained. "
+        "Neither solved nor proved infeasible within all steps; more of them may help. "
         "Raise newton_steps, or iterations where newton_steps is 0."
     ),
     Status.NON_CONVEX: (

@@ -3,9 +3,10 @@ they are part of, and the derivative of what it finds. Each costs one Riccati re
 
 **On the active rows.** In scaled rows v, multipliers y/E and with the residual e(v) = v − prox(v)
 of `qp/problem.py` the optimality conditions are gradient = 0 and e(v + y/ρ) = y/ρ. With the
-derivative D of e a semismooth Newton step from inputs u (N, m) and multipliers y (rows,) asks
+derivative D of e a semismooth Newton step from moves z (N, m), the inputs where there is no gain,
+and multipliers y (rows,) asks
 
-    gradient + P du + rows'dy = 0,        dy (1 − D)/ρ = D dv + c,    c = e − y/ρ.
+    gradient + P dz + rows'dy = 0,        dy (1 − D)/ρ = D dv + c,    c = e − y/ρ.
 
 Where D = 1 (a row held at its bound) 0·dy becomes dy/κ with a large κ, a proximal step on y:
 dy = ω dv + ω_c c, with ω = ρ D/(1 − D + D ρ/κ) and ω_c = ρ/(1 − D + D ρ/κ). What is left is an LQR
@@ -42,6 +43,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxmpc.mpc.stagewise.recursion_kernels import Gains
 from jaxmpc.mpc.stagewise.stages import (
     Stages,
     conditions,
@@ -82,21 +84,21 @@ class Errors(NamedTuple):
     gradient: Array
 
     @classmethod
-    def of(cls, s: Stages, E: Array, rho: Array, u: Array, y: Array) -> "Errors":
-        """Return those of inputs u (N, m) and multipliers y (rows,)."""
-        found, push = conditions(s, u, y), scaled_multipliers(E, y) / rho
+    def of(cls, s: Stages, E: Array, rho: Array, z: Array, y: Array) -> "Errors":
+        """Return those of moves z (N, m) and multipliers y (rows,)."""
+        found, push = conditions(s, z, y), scaled_multipliers(E, y) / rho
         v = E * found.rows + push
         return cls(v, s.bounds.scaled(E).prox_residual(v, rho) - push, found.gradient)
 
 
-def distance(s: Stages, E: Array, rho: Array, u: Array, y: Array) -> Array:
+def distance(s: Stages, E: Array, rho: Array, z: Array, y: Array) -> Array:
     """Return how far the conditions are from holding as a number in units of the cost: Σ ρ c², c in
     rows of variance 1 under exp(−J), and Σ gradient²/R over the inputs.
 
     Beside a hundred times that of zero it tells a warm start from numbers that are none, such as
     the plan of a state far off.
     """
-    _, c, gradient = Errors.of(s, E, rho, u, y)
+    _, c, gradient = Errors.of(s, E, rho, z, y)
     weight = jnp.diagonal(s.R, axis1=-2, axis2=-1)
     return jnp.sum(rho * c**2) + jnp.sum(gradient**2 / jnp.where(weight > 0, weight, 1.0))
 
@@ -104,7 +106,7 @@ def distance(s: Stages, E: Array, rho: Array, u: Array, y: Array) -> Array:
 def newton_direction(
     s: Stages, E: Array, rho: Array, v: Array, kappa: float | None = None
 ) -> Callable[[Array, Array], tuple[Array, Array]]:
-    """Return the linear map (c, gradient) → (du, dy) of a Newton step at v + y/ρ (rows,). kappa: κ,
+    """Return the linear map (c, gradient) → (dz, dy) of a Newton step at v + y/ρ (rows,). kappa: κ,
     None for that of Newton's method."""
     D = s.bounds.scaled(E).curvature(v, rho)[0]
     loose = 1 - D + D * rho / (Constants.of(E.dtype).linear if kappa is None else kappa)
@@ -113,18 +115,24 @@ def newton_direction(
 
     def step(c: Array, gradient: Array) -> tuple[Array, Array]:
         push = rho * c / loose
-        gx, gu = s.pull(E * push)
-        dx, du = minimise(s, gains, -gx, -gu - gradient)
-        return du, E * (omega * E * s.rows(dx, du) + push)
+        dx, du = descent(s, gains, E * push, gradient)
+        return s.moves(dx, du), E * (omega * E * s.rows(dx, du) + push)
 
     return step
 
 
-def stage_newton_step(s: Stages, E: Array, rho: Array, u: Array, y: Array) -> tuple[Array, Array]:
-    """Return inputs u (N, m) and multipliers y (rows,) after a Newton step."""
-    v, c, gradient = Errors.of(s, E, rho, u, y)
-    du, dy = newton_direction(s, E, rho, v)(c, gradient)
-    return u + du, y + dy
+def descent(s: Stages, gains: Gains, pushes: Array, gradient: Array) -> tuple[Array, Array]:
+    """Return dx (N+1, n), du (N, m) of least penalised cost + pushes·rows + gradient·moves; pushes
+    (rows,), gradient (N, m)."""
+    gx, gu = s.pull(pushes)
+    return minimise(s, gains, s.at_fixed_moves(-gx, gradient), -gu - gradient)
+
+
+def stage_newton_step(s: Stages, E: Array, rho: Array, z: Array, y: Array) -> tuple[Array, Array]:
+    """Return moves z (N, m) and multipliers y (rows,) after a Newton step."""
+    v, c, gradient = Errors.of(s, E, rho, z, y)
+    dz, dy = newton_direction(s, E, rho, v)(c, gradient)
+    return z + dz, y + dy
 
 
 class Sides(NamedTuple):
@@ -211,11 +219,11 @@ class Limits(NamedTuple):
 
 @pytree
 class SearchState:
-    """Loop state of one instance: inputs u (N, m), multipliers y (rows,) or, of the interior point
+    """Loop state of one instance: moves z (N, m), multipliers y (rows,) or, of the interior point
     method, the sides' numbers, the rows, the gradient (N, m) of the Lagrangian and the least error
     that it came to itself; the best pair of all so far, the steps taken, and whether to go on."""
 
-    u: Array
+    z: Array
     dual: Any
     best: Pair
     steps: Array
@@ -223,7 +231,7 @@ class SearchState:
 
     @classmethod
     def begin(cls, best: Pair, dual: Any) -> "SearchState":
-        """Return the state before the first step, from the inputs of `best`."""
+        """Return the state before the first step, from the moves of `best`."""
         return cls(best.z, dual, best, jnp.int32(0), ~(best.near | best.finished))
 
 
@@ -233,13 +241,13 @@ def newton_search_step(most: int, constants: tuple, state: SearchState) -> Searc
     constants: stages, row scale E (rows,), rho (rows,) and eps.
     """
     s, E, rho, eps = constants
-    u, y = stage_newton_step(s, E, rho, state.u, state.dual)
-    best, steps = state.best.or_better(measured_pair(eps, s, E, u, y)), state.steps + 1
-    return SearchState(u, y, best, steps, ~(best.near | best.finished) & (steps < most))
+    z, y = stage_newton_step(s, E, rho, state.z, state.dual)
+    best, steps = state.best.or_better(measured_pair(eps, s, E, z, y)), state.steps + 1
+    return SearchState(z, y, best, steps, ~(best.near | best.finished) & (steps < most))
 
 
 def interior_step(most: int, constants: tuple, state: SearchState) -> SearchState:
-    """One interior point step, of which the first leads to the inputs of least cost without rows;
+    """One interior point step, of which the first leads to the moves of least cost without rows;
     the search ends after `most`, when the residuals are below a thousandth of eps, one
     step after they are small enough, or when the iterates have come to rest.
 
@@ -258,16 +266,15 @@ def interior_step(most: int, constants: tuple, state: SearchState) -> SearchStat
     gains = riccati(s, jnp.sum(omega, axis=0) * E**2)
 
     def direction(targets: Array) -> tuple[Array, Array, Sides]:
-        """Return the Newton step towards t z, e ν = targets (2, 2, rows): rows, inputs, sides."""
+        """Return the Newton step towards t z, e ν = targets (2, 2, rows): rows, moves, sides."""
         far = targets[0] - at.t * at.z
         give = jnp.where(limits.soft, (targets[1] - at.e * nu) / bend, 0.0)
         beta = jnp.where(has, (far + at.z * (r - give)) / loose, 0.0)
-        gx, gu = s.pull(E * jnp.sum(limits.sign * beta, axis=0))
-        dx, du = minimise(s, gains, -gx, -gu - gradient)
+        dx, du = descent(s, gains, E * jnp.sum(limits.sign * beta, axis=0), gradient)
         dv = E * s.rows(dx, du)
         dz = omega * limits.sign * dv + beta
         de = give + at.e * dz / bend
-        return dv, du, Sides(de - r - limits.sign * dv, dz, de)
+        return dv, s.moves(dx, du), Sides(de - r - limits.sign * dv, dz, de)
 
     mean = limits.mean(at)
     *_, guess = direction(jnp.zeros((2, *r.shape), r.dtype))
@@ -275,23 +282,23 @@ def interior_step(most: int, constants: tuple, state: SearchState) -> SearchStat
     ratio = limits.mean(at.moved(guess, reach)) / jnp.where(mean > 0, mean, 1.0)
     centre = mean * jnp.maximum(ratio**3, 1 - reach)
     curved = jnp.stack([guess.t * guess.z, guess.e * (limits.k * guess.e - guess.z)])
-    dv, du, step = direction(centre - jnp.clip(curved, -MOST_CURVED * mean, MOST_CURVED * mean))
+    dv, moved, step = direction(centre - jnp.clip(curved, -MOST_CURVED * mean, MOST_CURVED * mean))
     length = jnp.minimum(FRACTION * limits.length(at, step), 1.0)
-    sound = jnp.all(jnp.isfinite(du)) & (first | (length > REST))
+    sound = jnp.all(jnp.isfinite(moved)) & (first | (length > REST))
     length = jnp.where(sound, jnp.where(first, 1.0, length), 0.0)
     clean = lambda tree: jax.tree.map(lambda d: jnp.where(sound, d, 0.0), tree)
-    u = state.u + length * clean(du)
+    z = state.z + length * clean(moved)
     begun, at = limits.start(v + dv), at.moved(clean(step), length)
     at = jax.tree.map(lambda a, b: jnp.where(first, a, b), begun, at)
     y = s.bounds.admissible(fixed + E * limits.multipliers(at))
-    found = conditions(s, u, y)
-    pair = Pair.of(u, y, residuals_of(s, E, u, y, found), eps, rounding(u.dtype))
+    found = conditions(s, z, y)
+    pair = Pair.of(z, y, residuals_of(s, E, z, y, found), eps, rounding(z.dtype))
     again = pair.measured.within_tolerance & state.best.measured.within_tolerance
     best, steps = state.best.or_better(pair), state.steps + 1
     lost = (least < BEGUN) & (pair.error > LOST * least)
     wanted = ~(best.near | best.finished | again | lost) & sound & (steps < most)
     dual = at, found.rows, found.gradient, jnp.minimum(least, pair.error)
-    return SearchState(u, dual, best, steps, wanted)
+    return SearchState(z, dual, best, steps, wanted)
 
 
 class Search(NamedTuple):
@@ -322,33 +329,33 @@ class Search(NamedTuple):
 
 
 def stage_conditions(
-    s: Stages, constants: tuple[Array, Array], u: Array, y: Array
+    s: Stages, constants: tuple[Array, Array], z: Array, y: Array
 ) -> tuple[Callable[[Any], Any], Undo]:
     """The `conditions_of` that `qp.derivative.implicit` takes for the stages and (E, ρ).
 
-    The conditions F(s, u, y) = 0 hold at a solution, hence J d(u, y) = −dF with the matrix J of a
+    The conditions F(s, z, y) = 0 hold at a solution, hence J d(z, y) = −dF with the matrix J of a
     Newton step: one Riccati recursion, whatever the number of iterations, in float64 as in
     `qp/derivative.py`. Rows that touch with a zero multiplier count as inactive.
     """
     E, rho = constants
-    v = Errors.of(s, E, rho, u, y).v
-    flat = lambda inputs, rows: jnp.concatenate([inputs.ravel(), rows])
-    split = lambda d: (d[: u.size].reshape(u.shape), d[u.size :])
+    v = Errors.of(s, E, rho, z, y).v
+    flat = lambda moves, rows: jnp.concatenate([moves.ravel(), rows])
+    split = lambda d: (d[: z.size].reshape(z.shape), d[z.size :])
 
     def conditions_at(s: Stages) -> Array:
-        _, c, gradient = Errors.of(s, E, rho, u, y)
+        _, c, gradient = Errors.of(s, E, rho, z, y)
         return flat(gradient, c)
 
     def J(s: Stages, E: Array, rho: Array, v: Array, d: Array) -> Array:
-        du, dy = split(d)
-        at = jnp.zeros_like(du), jnp.zeros_like(dy)
-        found = jax.jvp(partial(conditions, s), at, (du, dy))[1]
+        dz, dy = split(d)
+        at = jnp.zeros_like(dz), jnp.zeros_like(dy)
+        found = jax.jvp(partial(conditions, s), at, (dz, dy))[1]
         push, D = scaled_multipliers(E, dy) / rho, s.bounds.scaled(E).curvature(v, rho)[0]
         return flat(found.gradient, D * (E * found.rows + push) - push)
 
     def inverse(s: Stages, E: Array, rho: Array, v: Array, b: Array) -> Array:
         step = newton_direction(s, E, rho, v, KAPPA)
-        zero = jnp.zeros_like(y, E.dtype), jnp.zeros_like(u, E.dtype)
+        zero = jnp.zeros_like(y, E.dtype), jnp.zeros_like(z, E.dtype)
 
         def follow(b: Array) -> Array:
             gradient, c = split(-b)

@@ -16,7 +16,7 @@ runs forward, Σ⁺ = (A + BK) Σ (A + BK)' + B G⁻¹ B' from Σ_0 = 0.
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -51,6 +51,7 @@ from jaxmpc.mpc.stagewise.stages import (
     minimise,
     predict,
     riccati,
+    rows_under,
     stage_residuals,
     unconstrained,
 )
@@ -78,8 +79,12 @@ from jaxmpc.sets.convex_sets import Ellipsoid
 UNROLL = 32
 # ADMM steps, where ADMM.iterations is None and Newton steps follow.
 ADMM_STEPS = 20
-# Newton steps before the interior point method, where ADMM.newton_steps is None.
+# Newton steps before the interior point method and after it, and steps of all three where
+# ADMM.newton_steps is None.
 NEWTON_STEPS = 6
+MOST_STEPS = 2 * NEWTON_STEPS + INTERIOR_STEPS
+# How much farther than under the gain a state may move without it: some digits of predictions.
+GROWTH = 100.0
 
 
 def solve_stagewise(
@@ -103,16 +108,16 @@ def solve_stagewise(
     residuals and gap of the returned inputs and multipliers, evaluated from the data in float64.
     What differs: no infeasibility is proved (a problem without a solution ends as ITERATION_LIMIT:
     soften the rows that may not hold). Derivatives with respect to every array of data are those of
-    solver.differentiate. warm_start: an earlier Plan or a WarmStart, whose states are not read.
-    solver.newton_steps: at most so many, a Riccati recursion each; 5 suffice where ADMM, or the
-    warm start, has found the active rows. None: 6, after them an interior point method where they
-    have not ended at the solution (its steps need rows with l < u), and 6 again; all in float64.
-    mpc.prestabilise is not read: the inputs are the variables, so a plant that grows more than
-    1e5-fold over the horizon in open loop has residuals above eps by rounding alone; `solve` takes
-    those. scale (rows,): the row scale of a similar problem
-    (`factor_stages(...).E`), which saves a Riccati recursion; it changes the path, not the answer.
-    A row of scale 0 counts as one that no input moves: where that is not so, the plan does not
-    become SOLVED.
+    solver.differentiate. warm_start: an earlier Plan or a WarmStart.
+    solver.newton_steps: at most so many, a Riccati recursion each, in float64; 5 suffice where
+    ADMM, or the warm start, has found the active rows. After the first 6, where these have not
+    ended at the solution, come steps of an interior point method, which need rows with l < u, and
+    the last 6 are Newton steps again. None: 72.
+    Predictions of unstable systems lose no digits: their variables are v, with inputs u = K x + v
+    by the gains of least cost without rows (mpc.prestabilise is not read).
+    scale (rows,): the row scale of a similar problem (`factor_stages(...).E`), which saves a
+    Riccati recursion, and with it these gains; it changes the path, not the answer. A row of scale
+    0 counts as one that no input moves: where that is not so, the plan does not become SOLVED.
 
     Disturbances: with policy="tightened" as above. With "affine" (a Box, or a Zonotope of
     independent generators) plan.feedback is M, found together with the plan by an interior point
@@ -146,8 +151,8 @@ def factor_stages(mpc: MPC, solver: ADMM = DEFAULT, scale: Reals | None = None) 
     if shape != (rows,):
         fail("scale", f"shape {shape}", f"Give ({rows},), one number a row")
     answers = answers_disturbances(mpc)
-    mpc = without_disturbance(mpc) if answers else mpc
     steps = solver.admm_steps(ADMM_STEPS) > 0 and not answers
+    mpc = without_disturbance(mpc) if answers else mpc
     return _factor(*arrays((mpc, solver.rho, scale)), steps=steps)
 
 
@@ -190,22 +195,54 @@ class StageFactor:
 @own_modes
 def _factor(mpc: MPC, rho: Any, scale: Any, steps: bool) -> StageFactor:
     s, fault = cleaned(Stages.of(mpc))
-    E = row_scale(s) if scale is None else jnp.asarray(scale, s.Q.dtype)
+    if scale is None:
+        motion = FreeMotion.of(s)
+        E, s = row_scale(s, motion), replace(s, gain=stabilising_gain(s, motion))
+    else:
+        E = jnp.asarray(scale, s.Q.dtype)
     inputs = s.horizon * s.B.shape[-1]
     rho = default_rho(E, inputs) if rho is None else jnp.asarray(rho, E.dtype)
     rho = jnp.broadcast_to(rho, (rho.shape[0] if rho.ndim == 2 else 1, E.shape[0]))
     gains = jax.lax.map(lambda rho: riccati(s, rho * E**2), rho) if steps else None
     # Finite data can still overflow, or be too near singular for their precision.
-    sound = all_finite((E, gains))
-    E, gains = jax.tree.map(lambda v: jnp.where(sound, v, 0.0), (E, gains))
-    return StageFactor(s, E, rho, gains, jnp.where(sound, fault, jnp.int32(Status.ITERATION_LIMIT)))
+    sound = all_finite((E, gains, s.gain))
+    E, gains, gain = jax.tree.map(lambda v: jnp.where(sound, v, 0.0), (E, gains, s.gain))
+    fault = jnp.where(sound, fault, jnp.int32(Status.ITERATION_LIMIT))
+    return StageFactor(replace(s, gain=gain), E, rho, gains, fault)
 
 
-def row_scale(s: Stages) -> Array:
+class FreeMotion(NamedTuple):
+    """How inputs move without rows: gains, and under exp(−J) the covariance that each adds to the
+    next state, noise (N, n, n), and that of all states, Sigma (N+1, n, n)."""
+
+    gains: Gains
+    noise: Array
+    Sigma: Array
+
+    @classmethod
+    def of(cls, s: Stages) -> "FreeMotion":
+        """Return that of stages."""
+        gains = riccati(s)
+        noise = matmul(s.B, matmul(gains.inverse, jnp.swapaxes(s.B, -1, -2)))
+        Sigma = covariances(gains.closed, noise)
+        return cls(gains, noise, jnp.concatenate([jnp.zeros_like(s.P)[None], Sigma]))
+
+
+def stabilising_gain(s: Stages, motion: FreeMotion) -> Array:
+    """Return K (N, m, n), that of least cost without rows where the same inputs would move a state
+    GROWTH times as far without it, and else zero. What the plan is does not depend on it, hence it
+    has no derivative."""
+    K, noise, Sigma = jax.lax.stop_gradient((motion.gains.K, motion.noise, motion.Sigma[1:]))
+    A = jnp.broadcast_to(jax.lax.stop_gradient(s.A), Sigma.shape)
+    alone = covariances(A, noise)
+    variances = (jnp.diagonal(V, axis1=-2, axis2=-1) for V in (alone, GROWTH**2 * Sigma))
+    open_loop, most = variances
+    return jnp.where(jnp.any(~(open_loop <= most)), K, 0.0)
+
+
+def row_scale(s: Stages, motion: FreeMotion) -> Array:
     """E (rows,): 1/E² is the variance of the row under exp(−J); 0 where that is zero."""
-    gains = riccati(s)
-    spread = matmul(s.B, matmul(gains.inverse, jnp.swapaxes(s.B, -1, -2)))
-    Sigma = jnp.concatenate([jnp.zeros_like(s.P)[None], covariances(gains.closed, spread)])
+    gains, _, Sigma = motion
     variance, own = [jnp.zeros(0, s.Q.dtype)], [jnp.zeros(0, s.Q.dtype)]
     square = lambda M, V: jnp.sum(matmul(M, V) * M, axis=-1)
     deviation = lambda V: jnp.sqrt(jnp.maximum(jnp.diagonal(V, axis1=-2, axis2=-1), 0.0))
@@ -251,7 +288,7 @@ def stage_splittings(
 def read(
     factor: StageFactor, s: Stages, bounds: Bounds, t: Array, free: tuple[Array, Array]
 ) -> tuple[Array, Array]:
-    """Inputs u (N, m) and multipliers y (rows,) that t stands for at the last penalty."""
+    """Moves v (N, m) and multipliers y (rows,) that t stands for at the last penalty."""
     E, rho = factor.E, factor.rho[-1]
     gains = jax.tree.map(lambda v: v[-1], factor.gains)
     p = bounds.project(t, rho)
@@ -259,7 +296,7 @@ def read(
     x, u = jax.tree.map(jnp.add, free, pushed)
     # A soft row that no input moves gets its penalty's gradient as multiplier: the gap closes.
     y = jnp.where(E == 0, s.bounds.penalty_gradient(s.rows(x, u)), E * rho * (t - p))
-    return u, s.bounds.admissible(y)
+    return s.moves(x, u), s.bounds.admissible(y)
 
 
 def plan_stages(
@@ -311,65 +348,67 @@ def _plan(
     mpc = jax.tree.map(lambda v: jnp.where(usable, v, 0), mpc)
     s = factor.stages.aimed(aim)
     if answers_disturbances(mpc):
-        return affine_plan(mpc, s, factor.E, fault, solver, aim, centred)
+        return affine_plan(mpc, replace(s, gain=None), factor.E, fault, solver, aim, centred)
     found = stage_solution(factor, s, solver, warm_start)
     found = replace(found, iterations=jnp.int32(solver.admm_steps(ADMM_STEPS)))
-    x = s.of_system(predict(s, found.z))
-    return answer(mpc, s.layout, found, fault, x, found.z, aim)
+    x = predict(s, found.z)
+    return answer(mpc, s.layout, found, fault, s.of_system(x), s.inputs(x, found.z), aim)
 
 
 def stage_solution(
     factor: StageFactor, s: Stages, solver: ADMM, warm_start: WarmStart | None
 ) -> QPSolution:
-    """Return the solution, inputs z (N, m) and multipliers y (rows,), with its status and its
+    """Return the solution, moves z (N, m) and multipliers y (rows,), with its status and its
     derivatives: that of what was measured of the float64 pair that Newton steps end at, before it
     was rounded, or where there were none of what is measured of this pair."""
     given = factor, s, solver, warm_start
     if solver.differentiate == "implicit":
         factor, *_ = given = jax.lax.stop_gradient(given)
-        u, y, measured = searched(*given)
-        u, y = implicit(stage_conditions, s, (factor.E, factor.rho[-1]), u, y)
-        y = s.bounds.following(y, factor.E, s.rows(predict(s, u), u))
+        z, y, measured = searched(*given)
+        z, y = implicit(stage_conditions, s, (factor.E, factor.rho[-1]), z, y)
+        y = s.bounds.following(y, factor.E, rows_under(s, z))
     else:
-        u, y, measured = searched(*given)
-    none = Proof.none(u, y)
+        z, y, measured = searched(*given)
+    none = Proof.none(z, y)
     if measured is not None:
-        return with_status(measured, u, y, none)
-    return assess(stage_residuals, (s, factor.E), u, y, none, tolerance(solver, u.dtype))
+        return with_status(measured, z, y, none)
+    return assess(stage_residuals, (s, factor.E), z, y, none, tolerance(solver, z.dtype))
 
 
 def searched(
     factor: StageFactor, s: Stages, solver: ADMM, warm_start: WarmStart | None
 ) -> tuple[Array, Array, Measured | None]:
-    """Inputs u (N, m) and multipliers y (rows,): ADMM, Newton steps, interior point method; and
+    """Moves z (N, m) and multipliers y (rows,): ADMM, Newton steps, interior point method; and
     what was measured of them where Newton steps end at them."""
     E, rho = factor.E, factor.rho
-    u, y = jnp.zeros((s.horizon, s.B.shape[-1]), E.dtype), jnp.zeros_like(E)
+    z, y = jnp.zeros((s.horizon, s.B.shape[-1]), E.dtype), jnp.zeros_like(E)
     if warm_start is not None:  # what is not finite counts as 0
         clean = lambda v: jnp.nan_to_num(jnp.asarray(v, E.dtype), posinf=0.0, neginf=0.0)
-        given = clean(warm_start.inputs), clean(warm_start.multipliers)
+        x, u, multipliers = map(clean, warm_start)
+        given = s.moves(s.joined(x, u), u), multipliers
         far = lambda pair: jax.lax.stop_gradient(distance(s, E, rho[-1], *pair))
-        near = far(given) <= 100 * far((u, y))
-        u, y = (jnp.where(near, v, 0.0) for v in given)
-    rows = s.rows(predict(s, u), u)
+        near = far(given) <= 100 * far((z, y))
+        z, y = (jnp.where(near, v, 0.0) for v in given)
+    rows = rows_under(s, z)
     fixed = s.bounds.unmoved(E, rows)
     if factor.gains is not None:
         bounds, v = s.bounds.scaled(E), E * rows
         t = v if warm_start is None else start(bounds, rho[0], v, scaled_multipliers(E, y))
         schedule, free = stage_splittings(factor, s, min(s.horizon, UNROLL))
         t, _ = iterate(schedule, bounds, t, solver.admm_steps(ADMM_STEPS), solver.alpha)
-        u, y = read(factor, s, bounds, t, free)
+        z, y = read(factor, s, bounds, t, free)
     y = jnp.where(E == 0, fixed, y)
-    newton = solver.most_newton_steps(NEWTON_STEPS)
-    if not newton:
-        return u, y, None
-    if solver.differentiate == "unrolled":
+    unrolled = solver.differentiate == "unrolled"
+    most = solver.most_newton_steps(NEWTON_STEPS if unrolled else MOST_STEPS)
+    if not most:
+        return z, y, None
+    if unrolled:
         step = lambda pair, _: (stage_newton_step(s, E, rho[-1], *pair), None)
-        u, y = jax.lax.scan(step, (u, y), length=newton)[0]
-        return u, s.bounds.admissible(y), None
-    interior = INTERIOR_STEPS if solver.newton_steps is None else 0
+        z, y = jax.lax.scan(step, (z, y), length=most)[0]
+        return z, s.bounds.admissible(y), None
+    newton, interior = min(most, NEWTON_STEPS), max(most - 2 * NEWTON_STEPS, 0)
     refine = partial(refined, Search(newton, interior, _always if solver.fixed else _while_open))
-    best = precisely(refine, s, E, rho[-1], fixed, tolerance(solver, u.dtype), u, y)
+    best = precisely(refine, s, E, rho[-1], fixed, tolerance(solver, z.dtype), z, y)
     return best.z, best.y, best.measured
 
 
@@ -386,15 +425,15 @@ def _while_open(step: Callable, most: int, constants: tuple, state: Any) -> Any:
 
 
 def refined(
-    search: Search, s: Stages, E: Array, rho: Array, fixed: Array, eps: Array, u: Array, y: Array
+    search: Search, s: Stages, E: Array, rho: Array, fixed: Array, eps: Array, z: Array, y: Array
 ) -> Pair:
-    """Return the best pair that a search finds from u (N, m), y (rows,); with interior point steps
-    Newton steps follow them once more."""
+    """Return the best pair that a search finds from moves z (N, m), y (rows,); with interior point
+    steps Newton steps follow them once more."""
 
     def go_on(best: Pair, first: Array) -> tuple[Pair, None]:
         return search.from_pair(s, E, rho, fixed, eps, best, first), None
 
-    best = measured_pair(eps, s, E, u, y)
+    best = measured_pair(eps, s, E, z, y)
     # Weights of rows that are held grow until rounding stops the interior point method; Newton's
     # are bounded. As a loop, so that both are compiled once.
     rounds = jnp.arange(2 if search.interior else 1) == 0

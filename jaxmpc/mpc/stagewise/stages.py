@@ -15,6 +15,11 @@ and the value function ½ x'S x + p'x of the steps after k gives (Rawlings, Mayn
 
 Only p runs backward and only x forward; all else is done for all stages at once.
 
+With a gain the inputs are u_k = K_k x_k + v_k and a plan is its moves v, as `mpc.prestabilise` is
+meant: x follows from v by A + BK, which does not lose the digits that an unstable A does, and so do
+the costates. The problem, its rows and the recursion above stay those in x and u, of which only the
+gradients are taken at fixed v.
+
 Where input rates are limited or weighed, the state here is (x_k, u_{k−1}), x_0 followed by u_{−1}:
 A and B get m more rows, u_k = u_k, the rate u_k − u_{k−1} is a row in state and input, and its cost
 Δu'W Δu is a part of Q, R and the cross term. The reference of u_{k−1} is that of u_k,
@@ -64,7 +69,8 @@ class Stages:
     zero.
     blocks, bounds: the rows of `rows.blocks`, and what is asked of all of them (rows,). aim: where
     a plan begins and what it tracks, with full references; none of it until it is known.
-    remembers: whether the state is (x_k, u_{k−1}), and n its size.
+    remembers: whether the state is (x_k, u_{k−1}), and n its size. gain K (N, m, n): plans are
+    moves v, the inputs u = K x + v; None: they are the inputs.
     """
 
     A: Array
@@ -79,6 +85,7 @@ class Stages:
     cross: Array | None = None
     aim: Aim = Aim(None)
     remembers: bool = static(default=False)
+    gain: Array | None = None
 
     @classmethod
     def of(cls, mpc: MPC) -> "Stages":
@@ -112,6 +119,24 @@ class Stages:
     def of_system(self, x: Array) -> Array:
         """Return the states of the system in those x (N+1, n) of the stages."""
         return x[:, : x.shape[1] - self.B.shape[-1]] if self.remembers else x
+
+    @property
+    def closed(self) -> Array:
+        """The matrix from a state to the next at fixed moves, A or A + BK (N, n, n)."""
+        return self.A if self.gain is None else self.A + matmul(self.B, self.gain)
+
+    def inputs(self, x: Array, v: Array) -> Array:
+        """Return the inputs (N, m) along x (N+1, n) for moves v (N, m)."""
+        return v if self.gain is None else v + apply(self.gain, x[:-1])
+
+    def moves(self, x: Array, u: Array) -> Array:
+        """Return the moves (N, m) of inputs u (N, m) along x (N+1, n)."""
+        return u if self.gain is None else u - apply(self.gain, x[:-1])
+
+    def at_fixed_moves(self, gx: Array, gu: Array) -> Array:
+        """Return the gradient in x (N+1, n) at fixed moves of a function of x and u whose
+        gradients in these are gx (N+1, n) and gu (N, m)."""
+        return gx if self.gain is None else gx.at[:-1].add(apply_transposed(self.gain, gu))
 
     @property
     def layout(self) -> Layout:
@@ -274,11 +299,17 @@ def minimise(s: Stages, gains: Gains, gx: Array, gu: Array, unroll: int = 1) -> 
     return tracking(gains, s.A, s.B, gx, gu, unroll)
 
 
-def predict(s: Stages, u: Array) -> Array:
-    """x (N+1, n) from x_0 under the inputs u (N, m)."""
+def predict(s: Stages, v: Array) -> Array:
+    """x (N+1, n) from x_0 under the moves v (N, m), without a gain the inputs."""
     x0 = s.aim.x0
-    w = jnp.broadcast_to(apply(s.B, u) + s.c, (s.horizon, len(x0)))
-    return jnp.concatenate([x0[None], recurrence(s.A, w, x0)])
+    w = jnp.broadcast_to(apply(s.B, v) + s.c, (s.horizon, len(x0)))
+    return jnp.concatenate([x0[None], recurrence(s.closed, w, x0)])
+
+
+def rows_under(s: Stages, v: Array) -> Array:
+    """The rows (rows,) from x_0 under the moves v (N, m)."""
+    x = predict(s, v)
+    return s.rows(x, s.inputs(x, v))
 
 
 def unconstrained(s: Stages, gains: Gains, weights: Array) -> tuple[Array, Array]:
@@ -293,8 +324,9 @@ def unconstrained(s: Stages, gains: Gains, weights: Array) -> tuple[Array, Array
 
 
 class Optimality(NamedTuple):
-    """Rows (rows,) and gradient (N, m) of the Lagrangian with respect to the inputs, the terms of
-    both and of the cost, and the sums that the gradient is a difference of."""
+    """Rows (rows,) and gradient (N, m) of the Lagrangian with respect to the moves, the terms of
+    both and of the cost, the sums that the gradient is a difference of, and how large the cost is.
+    """
 
     rows: Array
     gradient: Array
@@ -302,16 +334,18 @@ class Optimality(NamedTuple):
     gradient_terms: Array
     cost_terms: Array
     gradient_size: Array
+    cost_size: Array
 
 
-def conditions(s: Stages, u: Array, y: Array) -> Optimality:
-    """Optimality conditions of inputs u (N, m) and multipliers y (rows,), by the states that u
-    leads to and the costates λ_k = ∂J/∂x_k + H'y + A'λ_{k+1}."""
-    x = predict(s, u)
+def conditions(s: Stages, v: Array, y: Array) -> Optimality:
+    """Optimality conditions of moves v (N, m) and multipliers y (rows,), by the states that v
+    leads to and the costates λ_k = ∂J/∂x_k + H'y + A'λ_{k+1}, at fixed moves."""
+    x = predict(s, v)
+    u = s.inputs(x, v)
     (gx, own), (px, pushed) = s.gradient(x, u), s.pull(y)
     # Of cost and rows apart: at the solution their sum is small, its rounding is that of the parts.
-    both = jnp.stack([gx, px])
-    back = jax.vmap(lambda g: recurrence(s.A, g[:-1], g[-1], adjoint=True))(both)
+    both = jnp.stack([s.at_fixed_moves(gx, own), s.at_fixed_moves(px, pushed)])
+    back = jax.vmap(lambda g: recurrence(s.closed, g[:-1], g[-1], adjoint=True))(both)
     of_cost, of_rows = jnp.concatenate([back[:, 1:], both[:, -1:]], axis=1)
     absolute = jax.tree.map(jnp.abs, replace(s, bounds=Bounds(s.bounds.l, s.bounds.u)))
     # A state is a difference of the terms of its step, as where torques balance the weight.
@@ -320,12 +354,15 @@ def conditions(s: Stages, u: Array, y: Array) -> Optimality:
     # Its gradient, of the terms of its distance from the reference, and of slopes.
     far = absolute.aim._replace(states=-absolute.aim.states, inputs=-absolute.aim.inputs)
     weighed, own_terms = replace(absolute, aim=far).gradient(terms, jnp.abs(u))
-    later = jax.lax.cumsum(weighed[1:], reverse=True)
+    later = jax.lax.cumsum(absolute.at_fixed_moves(weighed, own_terms)[1:], reverse=True)
     # The rounding of a costate is that of others too, as of a speed's that of its position.
-    later = later + apply_transposed(absolute.A, later)
+    later = later + apply_transposed(absolute.closed, later)
     back_terms = later + jnp.abs(of_cost) + jnp.abs(of_rows)
     cost_part = jnp.abs(own) + apply_transposed(absolute.B, jnp.abs(of_cost))
     row_part = jnp.abs(pushed + apply_transposed(s.B, of_rows))
+    # Of an expansion the cost at its point is not known, only gradients: those of all of x and u.
+    expansion = s.aim.slopes is not None
+    dx, du = (x, u) if expansion else (x - s.aim.states, u - s.aim.inputs)
     return Optimality(
         rows=s.rows(x, u),
         gradient=own + pushed + apply_transposed(s.B, of_cost + of_rows),
@@ -335,19 +372,20 @@ def conditions(s: Stages, u: Array, y: Array) -> Optimality:
         + apply_transposed(absolute.B, back_terms),
         cost_terms=(jnp.sum(terms * weighed) + jnp.sum(jnp.abs(u) * own_terms)) / 2,
         gradient_size=cost_part + row_part,
+        cost_size=(jnp.sum(jnp.abs(dx * gx)) + jnp.sum(jnp.abs(du * own))) / 2,
     )
 
 
-def stage_residuals(s: Stages, E: Array, u: Array, y: Array) -> Terms:
-    """As `qp.residuals.residual_terms` for the condensed QP in the inputs; E (rows,): row scale."""
-    return residuals_of(s, E, u, y, conditions(s, u, y))
+def stage_residuals(s: Stages, E: Array, v: Array, y: Array) -> Terms:
+    """As `qp.residuals.residual_terms` for the condensed QP in the moves; E (rows,): row scale."""
+    return residuals_of(s, E, v, y, conditions(s, v, y))
 
 
-def residuals_of(s: Stages, E: Array, u: Array, y: Array, found: Optimality) -> Terms:
+def residuals_of(s: Stages, E: Array, v: Array, y: Array, found: Optimality) -> Terms:
     """Return `stage_residuals` of a pair whose conditions are known.
 
     With the gradient g of the Lagrangian the gap z'Pz + q'z + g(Az) + g*(y) is
-    u'g + g(rows) + g*(y) − y'rows: at the optimum both parts are zero. Its size is at most twice
+    v'g + g(rows) + g*(y) − y'rows: at the optimum both parts are zero. Its size is at most twice
     what the plan costs: where the model is unstable, parts of g are larger by |A|^N.
 
     What is typical of a row and of an input is what is the most of the same one over the horizon.
@@ -360,19 +398,20 @@ def residuals_of(s: Stages, E: Array, u: Array, y: Array, found: Optimality) -> 
     reach = jnp.where(E > 0, jnp.sqrt(2 * found.cost_terms) / jnp.where(E > 0, E, 1.0), 0.0)
     own_terms = found.row_terms + reach
     penalty, support, product = bounds.cost(found.rows), bounds.support(y), y * found.rows
-    gap = jnp.sum(u * found.gradient) + jnp.sum(penalty + support - product)
-    terms = jnp.sum(jnp.abs(u) * found.gradient_terms)
+    gap = jnp.sum(v * found.gradient) + jnp.sum(penalty + support - product)
+    terms = jnp.sum(jnp.abs(v) * found.gradient_terms)
     slopes = bounds.slope(found.rows) + jnp.abs(y)
     terms = terms + jnp.sum(slopes * own_terms + jnp.abs(support))
     size = jnp.sum(penalty + jnp.abs(support) + jnp.abs(product))
-    size = size + jnp.sum(jnp.abs(u) * found.gradient_size)
-    size = jnp.minimum(size, 2 * (found.cost_terms + jnp.sum(penalty)))
+    size = size + jnp.sum(jnp.abs(v) * found.gradient_size)
+    size = jnp.minimum(size, 2 * (found.cost_size + jnp.sum(penalty)))
 
-    def most(v: Array) -> Array:
-        parts = split(s.layout, v)
+    def most(values: Array) -> Array:
+        parts = split(s.layout, values)
         largest = [jnp.max(part, axis=0, initial=0.0) for part in parts]
         pairs = zip(parts, largest, strict=True)
-        return jnp.concatenate([*(jnp.broadcast_to(m, p.shape).ravel() for p, m in pairs), v[:0]])
+        spread = [jnp.broadcast_to(m, part.shape).ravel() for part, m in pairs]
+        return jnp.concatenate([*spread, values[:0]])
 
     known = bounds.sizes()
     row_size = jnp.maximum(known, jnp.abs(found.rows))
@@ -389,9 +428,9 @@ def residuals_of(s: Stages, E: Array, u: Array, y: Array, found: Optimality) -> 
     ]
 
 
-def measured_pair(eps: Array, s: Stages, E: Array, u: Array, y: Array) -> Pair:
-    """The pair of inputs u (N, m) and multipliers y (rows,), its residuals measured in float64; E:
+def measured_pair(eps: Array, s: Stages, E: Array, v: Array, y: Array) -> Pair:
+    """The pair of moves v (N, m) and multipliers y (rows,), its residuals measured in float64; E:
     row scale (rows,)."""
-    y, floor = s.bounds.admissible(y), rounding(u.dtype)
-    pair = lambda s, E, u, y, eps: Pair.of(u, y, stage_residuals(s, E, u, y), eps, floor)
-    return precisely(pair, s, E, u, y, eps)
+    y, floor = s.bounds.admissible(y), rounding(v.dtype)
+    pair = lambda s, E, v, y, eps: Pair.of(v, y, stage_residuals(s, E, v, y), eps, floor)
+    return precisely(pair, s, E, v, y, eps)
