@@ -805,6 +805,7 @@ def of_one_state(inputs):
     return jm.MPC(jm.LinearSystem([[0.9]], [1.0]), 1.0, 1.0, horizon=2, inputs=inputs)
 
 
+@pytest.mark.long
 def test_masked_arrays_that_hide_nothing_are_arrays():
     box = jm.Box(np.ma.array([-1]), np.ma.array([1.0]))
     plan = jm.solve(of_one_state(box), np.ma.array([0.0]), solver=LIGHT)

@@ -60,6 +60,7 @@ MADE = {
 SLOW = [pytest.param(k, marks=pytest.mark.slow if "simulated" in k else ()) for k in MADE]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", SLOW)
 def test_copies_answer_as_the_first(name, tmp_path):
     make, answers = MADE[name]

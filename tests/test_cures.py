@@ -77,6 +77,7 @@ def test_maps_with_limited_rates_as_the_messages_ask():
     assert meaning == "a of a half-space a'x <= b that holds all feasible states"
 
 
+@pytest.mark.long
 def test_an_infeasible_plan_does_not_look_like_a_plan():
     """Its text begins with the status and holds no cost; its multipliers are no sensitivities, and
     the cure that the refusal names finds the limits."""

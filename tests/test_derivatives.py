@@ -230,6 +230,7 @@ CASES = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.first(2)
 def test_derivatives_of_all_data_at_once(name):

@@ -120,6 +120,7 @@ def near(one, other):
     jax.tree.map(lambda v, w: np.testing.assert_allclose(v, w, rtol=2e-3, atol=2e-3), one, other)
 
 
+@pytest.mark.long
 def test_a_plan_is_traced_without_implicit_promotion_on_a_mesh_that_is_not_the_context():
     """Arrays have explicit axes in their type without `jax.set_mesh` too. The modes act on what is
     traced, so that nothing need be compiled here."""
@@ -168,6 +169,7 @@ def of_constants():
     }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", of_constants())
 @pytest.mark.first(4)
 def test_constants_inside_jit_may_be_arrays_of_jax(name):

@@ -46,6 +46,7 @@ def test_a_namespace_lists_itself(name):
         assert entry in module.__doc__, f"{entry} is missing in the docstring of {name}"
 
 
+@pytest.mark.long
 def test_what_few_need_is_imported_late():
     """By `import jaxmpc` and all its names, and by the command before it knows what to do."""
     late = {"mujoco", "matplotlib", "zarr", "xarray", "pydantic", "PIL"}
@@ -56,6 +57,7 @@ sys.exit(', '.join({late} & set(sys.modules)))"""
     assert done.stderr.strip() == ""
 
 
+@pytest.mark.long
 def test_a_function_that_imports_names_is_compiled_once():
     """The names of a user's jitted function may be used in it first, and imported while it is
     traced: nothing of that may change what JAX knows the function's program by."""
@@ -75,6 +77,7 @@ assert scaled._cache_size() == 1, scaled._cache_size()"""
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.long
 def test_names_are_first_used_in_many_threads_at_once():
     program = """from concurrent.futures import ThreadPoolExecutor
 from threading import Barrier

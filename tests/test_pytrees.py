@@ -53,6 +53,7 @@ def test_no_class_compares_arrays():
             assert hash(object.__new__(c)) is not None or c.__hash__ is not None
 
 
+@pytest.mark.long
 def test_equality_and_hash():
     mpc = problem(
         soft=jm.Soft([[1.0, 0.0]], upper=[1.0]), outputs=jm.Outputs([[1.0, 1.0]], [-3], [3])

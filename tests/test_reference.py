@@ -39,6 +39,7 @@ def shown(package, entry):
     return names, rows
 
 
+@pytest.mark.long
 def test_signatures_are_those_of_python(package):
     """Names and their order, of all that can be called, by another way to find them."""
     for entry in ENTRIES:

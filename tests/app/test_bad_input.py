@@ -540,6 +540,7 @@ def test_a_full_disk_is_named_before_the_sweep_starts(refused, monkeypatch):
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("line", ["sweep --horizon 1000000000", "sweep --horizont 3"])
 @pytest.mark.first(1)
 def test_the_installed_command_does_the_same(line, tmp_path):

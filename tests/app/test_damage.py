@@ -98,6 +98,7 @@ def damages(folder, count, seed):
         file.write_bytes(good)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("count", "seed"), [(40, 0), pytest.param(1000, 1, marks=pytest.mark.slow)]
 )

@@ -422,6 +422,7 @@ def test_a_trade_off_shows_the_front_dominated_points_and_the_start():
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("loss: far", "loss: loud")
 
 
+@pytest.mark.long
 def test_a_plan_over_its_horizon():
     """Lines hold its numbers; grey and red follow the limits of each step, those of any kind of
     rows with one entry; what is no plan is told by its status."""

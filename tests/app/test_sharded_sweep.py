@@ -50,6 +50,7 @@ def whole(tmp_path, capsys):
     return tmp_path / "whole"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("first", "rest"),
     [(["3/9", "5/9"], ["0/2", "1/2"]), (["2/3", "0/3"], ["1/3"]), (["0/2"], ["1/2"])],
@@ -74,6 +75,7 @@ def test_shards_of_any_split_make_what_one_process_makes(whole, tmp_path, capsys
     assert run("verify out") == 0
 
 
+@pytest.mark.long
 def test_shards_have_smaller_blocks_of_the_same_parts(tmp_path, monkeypatch, capsys):
     """So that each has some to do; one process goes on with them as they are."""
     monkeypatch.setattr(batches, "CHUNK", 30)
@@ -128,6 +130,7 @@ def test_a_job_array_and_an_indexed_job(whole, tmp_path, monkeypatch):
         assert_same(tmp_path / name / "sweep.zarr", whole / "sweep.zarr")
 
 
+@pytest.mark.long
 def test_a_url(whole, tmp_path, capsys):
     fsspec = pytest.importorskip("fsspec")
     try:

@@ -156,6 +156,7 @@ def test_mpc_policy_is_the_controller_and_has_its_derivatives():
             np.testing.assert_allclose(slope[i], (moved(1) - moved(-1)) / 2e-4, rtol=1e-4)
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore:.*Box observation space m")
 @pytest.mark.filterwarnings("ignore:.*not within the observation space|.*normalize")
 @pytest.mark.filterwarnings("ignore:.*We recommend you to use a symmetric")

@@ -38,6 +38,7 @@ def gaussian():
     return jm.simulate_many(LAW, SYSTEM, np.zeros((LOOPS, 2)), STEPS, noise=NOISE, observer=FILTER)
 
 
+@pytest.mark.long
 def test_covariances_of_lqg_solve_the_lyapunov_equations(gaussian):
     """State and estimation error, jointly: z = (x, x − x̂_t|t−1) is a linear system under white
     noise, whose stationary covariance solves a Lyapunov equation. P of the filter by scipy."""
@@ -68,6 +69,7 @@ def test_covariances_of_lqg_solve_the_lyapunov_equations(gaussian):
     np.testing.assert_allclose(gaussian.inputs, filtered @ K.T, atol=1e-12)
 
 
+@pytest.mark.long
 def test_noise_has_its_covariances_and_seeds(gaussian):
     """What drives the plant is white with covariance W; loops keep theirs whatever the chunks."""
     x, u = gaussian.states, gaussian.inputs
@@ -110,6 +112,7 @@ def test_estimates_converge_without_noise():
     assert plain.estimates is None and known.estimates.shape == (STEPS, 2)
 
 
+@pytest.mark.long
 def test_units_of_states_and_outputs_decide_nothing():
     """Units up to 2^40 apart: the same gain of the steady state, or the same error."""
     hidden = np.array([[1.0, 0, 0]])
@@ -134,6 +137,7 @@ def test_units_of_states_and_outputs_decide_nothing():
                         observer.prepared()
 
 
+@pytest.mark.long
 def test_time_varying_filter_is_the_textbook_recursion():
     """Covariances and estimates of the extended filter, on a linear plant, by NumPy."""
     P = np.diag([0.2, 0.5])
@@ -197,6 +201,7 @@ def test_delayed_loops_with_filter_and_moving_references(kind):
     np.testing.assert_allclose(late.cost, want.cost, atol=1e-7)
 
 
+@pytest.mark.long
 def test_a_delay_is_predicted_by_the_first_of_systems_that_differ():
     """Three times the same one: the loop is that of the system."""
     A, B = 0.9 * np.eye(2), [[0.1], [1.0]]
@@ -223,6 +228,7 @@ def test_a_robots_own_model_predicts_its_delay():
     assert np.abs(naive.states - late.states).max() > 1e-3
 
 
+@pytest.mark.long
 def test_references_of_each_loop():
     """What each gives alone, in both shapes; also where B = T + N, so that shapes coincide."""
     steps = 4
@@ -364,6 +370,7 @@ def test_bad_noise_and_observers_are_named():
             call()
 
 
+@pytest.mark.long
 def test_a_law_gives_nan_of_nan_and_forgets_it():
     """A Controller's u stays finite; a law says what it has, and each state has its own."""
     bad = np.array([0.1, np.nan])

@@ -65,6 +65,7 @@ def test_inputs_are_those_of_plans_from_each_state(run):
     assert 0.4 - 1e-6 < distance.min() < 0.41
 
 
+@pytest.mark.long
 def test_real_time_iterations_are_one_program_a_sample():
     """A loop is what the controller gives sample by sample, of one QP each."""
     model = lambda x, u: jnp.stack([x[0] + H * x[1], x[1] + H * (u[0] - jnp.sin(2 * x[0]))])
@@ -143,6 +144,7 @@ def cart(model, weight=1.0):
     return jm.NonlinearMPC(mpc, model)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", [Learned, Stepping])
 def test_learned_plants_are_data(kind):
     """Loops of plants that differ in their numbers share a program, and are those of each."""
@@ -190,6 +192,7 @@ class Exact:
         return {"place": x[0]}
 
 
+@pytest.mark.long
 def test_linear_models_and_views_of_objects_are_theirs():
     """Of an object that is no pytree both were ignored, without a word."""
     seen = Task(lambda view: view["place"], weight=1.0)
@@ -272,6 +275,7 @@ def test_a_bad_reading_spoils_no_later_step(run):
     np.testing.assert_allclose(after.u, run.inputs[2], atol=1e-5)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("argument", "make"),
     [

@@ -167,6 +167,7 @@ def test_redundant_inputs():
     assert np.abs(found.u).max() > 1 - 1e-5
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_targets_of_redundant_inputs_in_any_units(seed):
     """Three inputs, one tracked output: it is as near as linear programs bring it, with the least
@@ -405,6 +406,7 @@ def test_what_cannot_be_told_apart_is_named():
         prepared((Disturbance("input", 1.0), Disturbance("output", 1.0)), first)
 
 
+@pytest.mark.long
 def test_bad_arguments_are_named(controller):
     good = observer(LOADS["input"])
     free = OffsetFreeController(controller, good)

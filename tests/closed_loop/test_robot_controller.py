@@ -365,6 +365,7 @@ def test_bad_problems_and_controllers_are_named(pendulum, linear_mpc):
             call()
 
 
+@pytest.mark.long
 def test_a_problem_of_traced_weights_is_that_of_their_values(pendulum):
     """Inside jit too, where the model of the robot is made from what is known."""
 

@@ -152,6 +152,7 @@ def test_messages_say_what_to_give(one_step):
         simulate(one_step, ONE_STEP.system, np.zeros(1), 4, reference=np.zeros(7))
 
 
+@pytest.mark.long
 def test_previous_input_starts_the_loop():
     """Rate limits count from the input before the first sample: |u_0 − 1| ≤ 0.1."""
     mpc = problems.scalar(horizon=2, x_max=50.0, u_max=5.0, input_rate_limit=np.array([0.1]))

@@ -31,6 +31,7 @@ def feedback(joint):
     return LinearFeedback(jm.robot_mpc(plant, horizon=5), np.array([[-4.0, -2.0]]), joint)
 
 
+@pytest.mark.long
 def test_runs_are_stored_resumed_and_those_of_simulate_many(tmp_path, monkeypatch, joint, feedback):
     """Six robots in blocks of three: the second block is done by the second call."""
     x0s, factors = draw_robots(joint, 6, seed=3, mass=0.2)

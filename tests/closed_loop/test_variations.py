@@ -29,6 +29,7 @@ def test_first_robots_do_not_depend_on_how_many_there_are(arm):
     assert all(np.any(other[name] != few[name]) for name in few)
 
 
+@pytest.mark.long
 def test_numbers_are_uniform_in_their_ranges(arm):
     model, count = arm.mujoco, 2000
     found = randomised(arm, count, **ALL)

@@ -23,6 +23,7 @@ def run(name, **settings):
         return module.run(module.Settings(**settings))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("n", "m", "N", "seed"), [(2, 1, 20, None), (3, 2, 4, 0)])
 def test_condensed_matrices_entry_by_entry(n, m, N, seed):
     """H, f, G and bounds against explicit powers of A; the lesson's joint and a random system."""
@@ -116,6 +117,7 @@ def test_problem_5_rows():
     assert limits.states.labels[3] == "elbow >= -1.8 rad"
 
 
+@pytest.mark.long
 def test_arm_dynamics_against_mujoco():
     """M, C dq + g of the two-link arm, and its linearisation by automatic differentiation."""
     mujoco = pytest.importorskip("mujoco")

@@ -47,6 +47,7 @@ def spread_calls(text: str) -> list[str]:
     return found
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "name",
     [

@@ -90,6 +90,7 @@ def require_optimal(mpc, regions, x):
         assert 0.5 * z @ c.P @ z + q @ z <= best.fun + 1e-7 * (1 + abs(best.fun))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(3))
 def test_laws_in_other_units(seed):
     check_law(seed)

@@ -58,6 +58,7 @@ def fuzzed(source, folder, calls, *options, compiler=COMPILERS[0] if COMPILERS e
     return found, [int(v) for v in done.stdout.splitlines()[-1].split()[1:]]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     "case",

@@ -41,6 +41,7 @@ def regions():
     return jm.explicit.critical_regions(problems.joint_o_inf(6))
 
 
+@pytest.mark.long
 @compiled
 @pytest.mark.parametrize("dtype, error", [("float64", 1e-9), ("float32", 2e-4)])
 def test_every_state_has_the_input_of_its_region(regions, tmp_path, dtype, error):
@@ -65,6 +66,7 @@ def test_every_state_has_the_input_of_its_region(regions, tmp_path, dtype, error
     assert law([np.nan, 0.0]) == (0, 3)
 
 
+@pytest.mark.long
 @compiled
 def test_a_law_in_other_units(regions, tmp_path):
     """The code is that of the plain problem, also where states' units are far apart."""

@@ -125,6 +125,7 @@ def test_few_programs_are_compiled(tmp_path, request):
     assert 0 < len(programs) <= 6
 
 
+@pytest.mark.long
 @compiled
 @pytest.mark.parametrize(
     "case",
@@ -188,6 +189,7 @@ def in_units(x, u, cost):
     )  # fmt: skip
 
 
+@pytest.mark.long
 @compiled
 @pytest.mark.parametrize("iterations", [12, 200])
 def test_a_status_in_other_units(iterations, tmp_path):
@@ -223,6 +225,7 @@ def test_a_status_in_other_units(iterations, tmp_path):
                 np.testing.assert_allclose(u, plan.inputs[0], atol=1e-4)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("policy", ["affine", "tube"])
 def test_some_hundred_steps_solve_plans_under_policies(policy, tmp_path):
     """From cold, at random states; the section of the tube has 124 generators, of 0.1 to 4e-13."""

@@ -46,6 +46,7 @@ class TestTerminalPoint:
         terminal_set=hard_sets.box(0, 0),
     )  # fmt: skip
 
+    @pytest.mark.long
     def test_real_inputs_exist(self):
         """Two inputs, corrected in rationals, bring x_N to 0; every other row holds too."""
         points = np.array([[1.5, -0.7], [-3.0, 1.0], [0.3, 0.2]])

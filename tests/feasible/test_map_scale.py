@@ -25,6 +25,7 @@ def test_a_million_states_within_four_gigabytes(tmp_path):
     assert resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss < 4 * 2**20  # kB
 
 
+@pytest.mark.long
 def test_labels_do_not_depend_on_the_scale_of_rows():
     """Times powers of two no bit of a proof changes; times powers of ten no label."""
     random = np.random.default_rng(3)

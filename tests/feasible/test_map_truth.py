@@ -87,12 +87,14 @@ def test_published_areas():
     assert area(problems.joint_o_inf()) == pytest.approx(problems.AREA_JOINT_O_INF, rel=1e-12)
 
 
+@pytest.mark.long
 def test_labels(planar):
     _, polygon, fmap = planar
     assert_right(fmap, polygon.contains(fmap.x0s), polygon.distance(fmap.x0s))
     assert fmap.counts()["feasible"] > 50 and fmap.counts()["infeasible"] > 50
 
 
+@pytest.mark.long
 def test_plans_in_rationals(planar):
     mpc, _, fmap = planar
     found = np.flatnonzero(fmap.label == 1)
@@ -282,6 +284,7 @@ class TestHiddenProduct:
         assert np.all(found.inner <= exactly + 1e-12) and np.all(found.outer >= exactly - 1e-12)
         np.testing.assert_array_less(found.outer - found.inner, 1e-9)
 
+    @pytest.mark.long
     @pytest.mark.parametrize("axes", [(0, 3), (3, 2), (0, 1, 2)])
     @pytest.mark.first(1)
     def test_slice(self, blocks, axes):

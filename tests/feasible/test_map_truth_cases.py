@@ -200,6 +200,7 @@ SLOW = (
 )  # fmt: skip
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "case",
     [*FAST, *(pytest.param(case, marks=pytest.mark.slow) for case in SLOW)],

@@ -148,6 +148,7 @@ def check(mpc, allow=0, whole=True) -> FeasibleSetMap:
     return fmap
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("none", [np.inf, *slow(*NONE[1:])])
 @pytest.mark.parametrize("missing", ["-0", "-0 -1", *slow("-0 +1", "-0 +0", "-0 +0 -1")])
 @pytest.mark.parametrize("kind", ["unstable", *slow("marginal", "rotating", "coupled")])

@@ -179,6 +179,7 @@ def margin_of_any_policy(mpc: jm.MPC, start: np.ndarray) -> float:
     return -linprog(-unit[-1], np.array(rows), np.array(bounds), bounds=free).fun
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("policy", ["tube", "tightened"])
 @pytest.mark.parametrize("rates", [np.array([1.1]), None])
 @pytest.mark.first(1)

@@ -55,6 +55,7 @@ class TestBoundaryArguments:
         assert found.inner[1] == pytest.approx(1.0, abs=1e-9)
 
 
+@pytest.mark.long
 def test_centre_keeps_a_margin_in_the_terminal_ellipsoid():
     """The bounds of a ball's rows, both its centre, are no equality that leaves no margin: of pairs
     without one not every end is proved. Ends against 2 (ball ⊕ box) by hand."""

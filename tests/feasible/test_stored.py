@@ -138,6 +138,7 @@ def test_large_blocks_hold_the_same_bits(tmp_path, monkeypatch):
             np.testing.assert_array_equal(value, other.arrays[name], err_msg=name)
 
 
+@pytest.mark.long
 def test_a_store_of_small_blocks_is_read_verified_and_resumed(tmp_path):
     """The file was written when blocks were what a program takes at once, here 39 states."""
     shutil.unpack_archive(Path(__file__).with_name("small_blocks.tar.xz"), tmp_path, filter="data")

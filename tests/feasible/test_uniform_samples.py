@@ -101,6 +101,7 @@ def test_triangulation_is_uniform():
     require_uniform(samples)
 
 
+@pytest.mark.long
 def test_chains_are_uniform_on_cubes_and_simplices():
     """Long boxes turned about, so that the chains must find their shape; a simplex with its law:
     each barycentric coordinate has the distribution 1 − (1 − t)^d."""

@@ -63,6 +63,7 @@ def readings(good):
     return x
 
 
+@pytest.mark.long
 @pytest.mark.first(1)
 @pytest.mark.parametrize(
     "steps", [{"newton_steps": 0, "iterations": 1000}, {}], ids=["ADMM", "exact"]

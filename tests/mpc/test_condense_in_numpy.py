@@ -33,6 +33,7 @@ def tightened(horizon):
     )  # fmt: skip
 
 
+@pytest.mark.long
 @pytest.mark.first(2)
 @pytest.mark.parametrize(
     ("make", "x64"),

@@ -94,6 +94,7 @@ def test_limits_are_kept_under_the_forecast():
     np.testing.assert_allclose(steady.inputs, jm.solve(drift, X0).inputs, atol=1e-9)
 
 
+@pytest.mark.long
 def test_bad_forecasts():
     with pytest.raises(ValueError, match=r"forecast: shape \(5, 2\). Give \(2,\) or \(6, 2\)"):
         jm.solve(PLAIN, X0, forecast=np.zeros((5, 2)))

@@ -90,6 +90,7 @@ ONE_STEP = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.first(1)
 @pytest.mark.parametrize("name", ONE_STEP)
 @pytest.mark.parametrize("solve", [solve_stagewise, jm.solve])

@@ -5,6 +5,7 @@ from dataclasses import replace
 import cvxpy as cp
 import jax
 import numpy as np
+import pytest
 
 import jaxmpc as jm
 
@@ -44,6 +45,7 @@ def stacked(problems):
     return jax.tree.map(lambda *v: np.stack(v), *(jax.tree.map(np.asarray, p) for p in problems))
 
 
+@pytest.mark.long
 def test_plans_from_far_outside_soft_limits_are_solved():
     """States up to 2.5 times beyond soft limits of a small weight, of which most plans once ended
     at the limit of steps; their costs are least."""
@@ -66,6 +68,7 @@ def test_plans_from_far_outside_soft_limits_are_solved():
         np.testing.assert_allclose(cost, least_cost(soft, x0), rtol=1e-6)
 
 
+@pytest.mark.long
 def test_soft_rows_without_a_penalty_are_no_rows():
     """A multiplier z with 0 < z < ρ does not exist for ρ = 0: the interior point method had no
     interior. Beside the same problem without such rows."""

@@ -38,6 +38,7 @@ def test_residuals_and_limits(plans):
     assert np.abs(plans.inputs[solved]).max() <= 2 + 1e-6
 
 
+@pytest.mark.long
 def test_plans_are_the_best(plans, states):
     """By non-negative least squares."""
     mpc = problems.joint_o_inf(10)

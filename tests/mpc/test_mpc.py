@@ -172,6 +172,7 @@ class TestCondensing:
 
 
 class TestAnotherSolver:
+    @pytest.mark.long
     @pytest.mark.parametrize("name", CASES)
     @pytest.mark.first(1)
     def test_states_kept(self, name):
@@ -213,6 +214,7 @@ class TestAnotherSolver:
 
 
 class TestRiccati:
+    @pytest.mark.long
     @pytest.mark.parametrize("horizon", [7, 1, 2, 5, 20])
     @pytest.mark.first(1)
     def test_unconstrained_is_lqr_at_every_horizon(self, horizon):
@@ -582,6 +584,7 @@ def test_bad_reference_raises(reference):
         jm.solve(problems.lecture(), np.zeros(2), reference=reference)
 
 
+@pytest.mark.long
 def test_derivatives_of_a_batch_of_plans_without_limits():
     """u = r/2 is the least of |x − r|² + |u|² + |u − r|² where x⁺ = u: for each of many states."""
     system = jm.LinearSystem(np.zeros((2, 2)), np.eye(2), dt=1.0)

@@ -351,6 +351,7 @@ def test_an_impossible_limit_is_not_solved(x64):
     assert plan.slack.max() > 0.5
 
 
+@pytest.mark.long
 def test_whole_steps_near_a_solution(x64):
     """The end of a lever near a point inside its circle: the defect of a whole step, times its
     multiplier, is more than the step gains (Maratos 1978). Without the correction of the states it
@@ -440,6 +441,7 @@ jax.tree_util.register_pytree_node(
 )
 
 
+@pytest.mark.long
 def test_functions_may_close_over_what_is_differentiated(x64):
     """A model and a task that are functions of traced numbers, and a task that is a pytree."""
     mpc = replace(around(steps=3).mpc, states=None)

@@ -70,6 +70,7 @@ def room(mpc, x0):
     return -found.fun
 
 
+@pytest.mark.long
 @pytest.mark.first(6)
 @pytest.mark.parametrize("seed", range(40))
 def test_each_plan_is_solved_or_proved_infeasible(seed):
@@ -81,6 +82,7 @@ def test_each_plan_is_solved_or_proved_infeasible(seed):
     np.testing.assert_array_equal(plans.status[clear], expected[clear])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "seed", [5, 16, 44, 51, 53, *(pytest.param(k, marks=pytest.mark.slow) for k in range(6, 16))]
 )
@@ -93,6 +95,7 @@ def test_each_state_is_labelled(seed):
     np.testing.assert_array_equal(label[clear], np.where(rooms > 0, 1, -1)[clear])
 
 
+@pytest.mark.long
 def test_a_program_without_an_answer_leaves_states_undecided():
     """Neither HiGHS nor its dual ends one of the programs of this map's bounding box."""
     mpc, x0s = draw(np.random.default_rng(28))
@@ -122,6 +125,7 @@ SLOW = [(stagewise, 2, 1, 1.0, 1.0), (jm.solve_many, 4, 2, 1e3, 1.0), (stagewise
 SLOW += [(jm.solve_many, 3, 2, 1.0, INF), (stagewise, 4, 2, 1e3, INF), (stagewise, 2, 1, 1.0, INF)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("solve", "n", "m", "unit", "most"),
     [*CASES, *(pytest.param(*case, marks=pytest.mark.slow) for case in SLOW)],

@@ -214,6 +214,7 @@ def wrong_labels(count, points, seed=0):
     return wrong
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("count", "points"), [(1, 20), pytest.param(10, 100, marks=pytest.mark.slow)]
 )
@@ -397,6 +398,7 @@ def test_plans_near_a_set_point_are_those_near_zero():
             )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_unstable_systems_that_differ_from_step_to_step(dtype):
     """Prestabilised, in units up to 2^40 apart: the plan of the inputs themselves."""

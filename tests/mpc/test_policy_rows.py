@@ -131,6 +131,7 @@ def require_labels(labels: np.ndarray, status: np.ndarray) -> None:
     assert 0 < np.sum(labels == 1) < len(labels)
 
 
+@pytest.mark.long
 @pytest.mark.first(2)
 @pytest.mark.parametrize(
     ("policy", "gain"), [("affine", False), ("tube", True), ("affine", True), ("tube", False)]
@@ -237,6 +238,7 @@ def by_daqp(mpc: jm.MPC, x0: np.ndarray, before: np.ndarray | None = None) -> tu
     return inputs, found[1] + constant
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("policy", ["tube", "affine"])
 def test_without_limits_the_nominal_inputs_are_those_of_the_lqr(policy):
     free = replace(robust(policy, terminal_set=None), states=None, inputs=None)
@@ -276,6 +278,7 @@ def test_units_play_no_part(policy):
         np.testing.assert_allclose(two, one, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.long
 def test_rows_of_tubes_have_a_solution_where_the_map_says_so():
     mpc = robust("tube")
     states, labels = labelled(mpc)
@@ -495,6 +498,7 @@ def solved(mpc: jm.MPC, x0: np.ndarray, before: np.ndarray) -> tuple:
     return plan.inputs, float(plan.cost) if plan.solved else np.inf
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("plan", "policy", "fields"),
     [
@@ -538,6 +542,7 @@ def test_errors(fields, message):
         jm.solve(robust(**{"policy": "affine", **fields}), [0.0, 0.0])
 
 
+@pytest.mark.long
 def test_policies_stage_by_stage_are_the_best_of_all():
     """Costs are those of the program with all sequences, and the policy keeps all limits under
     them; where that has no policy, none is claimed."""
@@ -629,6 +634,7 @@ def test_long_horizons_stage_by_stage():
         assert np.abs(x[:, :-1]).max() <= 2 + 1e-9 and np.abs(u).max() <= 0.5 + 1e-9
 
 
+@pytest.mark.long
 def test_what_policies_stage_by_stage_do_not_take():
     three = jm.sets.Zonotope([0.0, 0.0], [[0.1, 0.0, 0.1], [0.0, 0.1, 0.1]])
     with pytest.raises(ValueError, match="disturbance: has 3 generators of rank 2"):

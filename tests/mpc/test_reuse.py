@@ -117,6 +117,7 @@ def test_own_residuals_decide(mpc, states, few, tolerance):
     assert np.all(found.gap[good] <= tolerance * np.maximum(found.cost[good], 1))
 
 
+@pytest.mark.long
 def test_followed_plans_are_as_precise_as_solved_ones(mpc, states, few):
     """The solver ends far below its tolerance, and so must what follows: a law that is nearly
     right, as beside the border of its region, gives another plan within a loose tolerance."""
@@ -152,6 +153,7 @@ def test_states_that_are_not_finite_alike_or_far(mpc, states, solved, few):
     np.testing.assert_allclose(alike, np.broadcast_to(alike[:1], alike.shape), atol=1e-6)
 
 
+@pytest.mark.long
 def test_all_states_alike(mpc, few):
     found = jm.solve_many(mpc, np.full((COUNT, 2), 0.3), chunk=64)
     assert np.all(found.status == jm.Status.SOLVED)

@@ -146,6 +146,7 @@ def test_long_horizons_are_divided(monkeypatch):
             np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-12)
 
 
+@pytest.mark.long
 @pytest.mark.first(1)
 @pytest.mark.parametrize("staged", [False, True])
 def test_a_batch_side_by_side_is_the_scan(staged):

@@ -359,6 +359,7 @@ def test_rows_that_no_input_moves():
     np.testing.assert_allclose(plan.slack[0], [0.05, 0, 0], atol=1e-12)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("solver", [jm.solve, solve_stagewise])
 def test_multipliers_of_rows_that_no_input_moves_have_derivatives(solver):
     """Of x_0 beyond a soft limit: y = ρ + 2 q (x_0 − limit), which no optimality condition says."""
@@ -376,6 +377,7 @@ def test_multipliers_of_rows_that_no_input_moves_have_derivatives(solver):
     np.testing.assert_allclose(found[1], [4, -4, 1, 1], rtol=1e-12)
 
 
+@pytest.mark.long
 def test_what_is_solved_costs_what_the_plan_costs_however_unstable_the_model():
     """A² … A²⁰ grow by 2.8 a step, and with them the parts of a gradient whose sum is zero: a gap
     of 1 % of the cost was small beside them, and the plan called solved."""
@@ -401,6 +403,7 @@ def test_what_is_solved_costs_what_the_plan_costs_however_unstable_the_model():
     assert few.status == jm.Status.ITERATION_LIMIT
 
 
+@pytest.mark.long
 def test_unstable_systems_are_solved_where_the_condensed_program_is():
     """Systems that grow 3e3- to 1e12-fold over the horizon in open loop, also in coordinates that
     nearly coincide, where the plan is a difference of large terms."""
@@ -483,6 +486,7 @@ def test_float32_and_bad_elements():
     assert np.isnan(plans.inputs[1:3]).all() and np.isnan(plans.states[1:3]).all()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("one", "x64"),
     [
@@ -518,6 +522,7 @@ def test_a_state_far_off_is_solved_within_limits_or_not(one, x64):
     np.testing.assert_allclose(of_all, of_two, rtol=1e-9 if x64 else 1e-5)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("cost", [0.1, 1e-6])
 def test_held_inputs_do_not_move(cost):
     """Where limits hold all inputs of an unstable plant no state moves them, however little they
@@ -579,6 +584,7 @@ def test_wrong_arguments_are_told_before_the_factorization(monkeypatch, given, m
         jm.mpc.solve_stagewise(lecture(), **given)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("limits", [{}, {"inputs": jm.Box(-1, 1)}])
 @pytest.mark.parametrize(("fixed", "backend"), [(False, "cpu"), (False, "gpu"), (True, "cpu")])
 def test_plans_in_a_shard_map(limits, fixed, backend, monkeypatch):

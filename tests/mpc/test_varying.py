@@ -141,6 +141,7 @@ def value(request):
     return jax.jit(jax.value_and_grad(loss, has_aux=True))
 
 
+@pytest.mark.long
 def test_plans_are_those_of_the_program_written_down(value):
     mpc = varying()
     inputs, cost = by_hand(mpc, X0, BEFORE)
@@ -161,6 +162,7 @@ def moved(mpc, name, by):
     return part
 
 
+@pytest.mark.long
 def test_derivatives_are_those_of_differences(value):
     mpc, rng, step = varying(), np.random.default_rng(6), 1e-4
     slope = value(mpc)[1]

@@ -160,6 +160,7 @@ def assert_near(got: Any, expected: Any, rtol: float) -> None:
 class TestEveryField:
     """z, y and cost against central differences; jvp and vjp are each other's adjoint."""
 
+    @pytest.mark.long
     @pytest.mark.first(1)
     @pytest.mark.parametrize("first", range(0, 288, 8))
     def test_central_differences(self, x64, first):
@@ -334,6 +335,7 @@ class TestOptimalValue:
             near(one.radius, [-np.linalg.norm(y[10:12]), -np.linalg.norm(y[12:])])
             near((one.l + one.u)[10:], -y[10:])
 
+    @pytest.mark.long
     def test_dependent_rows(self, x64):
         """Two more rows with a push, 2 × row 0 and row 0 + row 1: y is one of many. The value is
         still smooth in q and P, which do not see y, and along a move of the whole feasible set,
@@ -743,6 +745,7 @@ class TestKinks:
             assert 0.01 < of_u < 0.99
             assert -0.99 < of_a < -0.01
 
+    @pytest.mark.long
     def test_small_multipliers_of_soft_rows_in_float32(self):
         """min ½|z − t|² + max(a'z − b, 0) at a'z = b with a multiplier of about 10⁻⁴ of z, of whose
         size the rounding of a'z seems to be: dz/dt is the projection on the row."""
@@ -769,6 +772,7 @@ class TestKinks:
         expected = np.eye(3) - a[:, :, None] * a[:, None, :]
         np.testing.assert_allclose(found, expected, atol=1e-5)
 
+    @pytest.mark.long
     def test_active_sets_in_bad_condition_in_float32(self):
         """Rows a, b at an angle of 0.01 that hold z at a vertex, dz/du = (a, b)⁻ᵀ; and the distance
         from p to an ellipse |Sz| ≤ 1 with half axes 1 and 1/300, z = M⁻¹p with M = I + λS²,
@@ -849,6 +853,7 @@ class TestUnrolled:
             assert abs(numeric) > 1e-3  # the argument matters
             np.testing.assert_allclose(np.sum(gradient[i] * d), numeric, rtol=1e-5)
 
+    @pytest.mark.long
     def test_implicit_ignores_settings_and_start(self, x64):
         qp, z, y = everything(0)
         f = lambda rho, z: jnp.sum(jm.solve_qp(qp, jm.ADMM(rho=rho), warm_start=(z, y)).z)

@@ -110,6 +110,7 @@ def searches(case, first, more):
     return [jax.jit(jax.vmap(search))(bounds, cold, point) for search in (loop, kernel)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("case", "first"),
     [
@@ -294,6 +295,7 @@ RECURSIONS = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("calls", "names"),
     [
@@ -414,6 +416,7 @@ def lowered(function, states, monkeypatch, compiler=None):
     return found
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("gradient", [False, True])
 @pytest.mark.first(1)
 def test_kernels_can_be_lowered_for_a_gpu(gradient, x64, monkeypatch):

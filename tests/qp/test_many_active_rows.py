@@ -23,6 +23,7 @@ def constructed(rng, P, A, active):
     return z, -P @ z - A.T @ y, l, u
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kernels", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_they_are_solved_by_steps_on_the_dual(kernels, monkeypatch):
     """Without the method of multipliers, each of whose steps has a system of all variables; also as

@@ -47,6 +47,7 @@ def margin(qp, scale=None, max_margin=1e3) -> float:
     return float(t)
 
 
+@pytest.mark.long
 @pytest.mark.first(1)
 @pytest.mark.parametrize(
     ("qp", "t"),
@@ -63,6 +64,7 @@ def test_known_values(qp, t):
     assert margin(filled(qp)) == pytest.approx(t, abs=1e-8)
 
 
+@pytest.mark.long
 def test_scale_and_limit():
     qp = filled(rows([[1], [1]], [2, -INF], [INF, 1]))
     assert margin(qp, scale=np.array([3.0, 1.0, 1.0])) == pytest.approx(-0.25, abs=1e-8)

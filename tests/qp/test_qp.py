@@ -89,6 +89,7 @@ class TestKnownAnswers:
             np.testing.assert_allclose(sol.z, z, atol=1e-8 * (1 + np.abs(z).max()))
             np.testing.assert_allclose(sol.y, y, atol=1e-6)
 
+    @pytest.mark.long
     @pytest.mark.parametrize("n", [8, 1, 5, 20])
     @pytest.mark.first(1)
     def test_singular_hessian(self, x64, n):
@@ -99,6 +100,7 @@ class TestKnownAnswers:
             assert sol.status == jm.Status.SOLVED
             np.testing.assert_allclose(sol.z, z, atol=1e-5)
 
+    @pytest.mark.long
     @pytest.mark.first(1)
     @pytest.mark.parametrize("n", [8, 1, 5, 20])
     def test_linear_programs(self, x64, n):
@@ -556,6 +558,7 @@ class TestFloat32:
         qp = jax.tree.map(lambda *v: np.stack(v).astype(np.float32), *programs)
         return qp, jax.tree.map(lambda v: np.asarray(v, float), self.many(qp))
 
+    @pytest.mark.long
     def test_rounded_hessian_of_half_rank(self):
         """Rounded, P has curvature of either sign where it had none and where rows lie. Nearly all
         programs have a solution within the tolerance even so; what is found is one to rounding."""
@@ -583,6 +586,7 @@ class TestFloat32:
         slack = np.where(y > 0, u - times(A, z), times(A, z) - l)
         assert np.all(abs(y) * np.maximum(slack, 0) <= 1e-5 * of_rows * (1 + abs(y)))
 
+    @pytest.mark.long
     def test_units_of_a_linear_cost(self):
         """The vertex of a linear program is where it is, whatever the size of its cost beside that
         of its limits: 16 rows meet there, and push."""
@@ -898,6 +902,7 @@ def test_settings_and_programs_are_trees_with_any_leaves():
 class TestOneRowDoesNotExcuseAnother:
     """A tolerance for rounding belongs to the row whose terms are large, not to the rest."""
 
+    @pytest.mark.long
     def test_contradiction_beside_a_large_row(self):
         f32 = lambda v: np.asarray(v, np.float32)
         rows = f32([[1, 0], [1, 0], [0, 1e5]])

@@ -106,6 +106,7 @@ def test_no_false_status_in_any_units(make, decades, x64):
         assert np.mean(np.isin(status, allowed)) >= 0.95
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("x64", "least"), [(True, (1e-10, 1e-13)), (False, (1e-5, 1e-6, 1e-9))])
 @pytest.mark.first(1)
 def test_a_small_coefficient_still_bounds(x64, least):

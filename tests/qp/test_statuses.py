@@ -54,6 +54,7 @@ def by_clarabel(P, q, A, l, u):
     return str(found.status), found.obj_val
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("scaled", [False, True])
 @pytest.mark.parametrize(("n", "m"), [(4, 6), pytest.param(8, 5, marks=pytest.mark.slow)])
 def test_random_programs(n, m, scaled):

@@ -115,6 +115,7 @@ def test_random_starts_meet_the_couplings():
     np.testing.assert_allclose(starts[:, 5], 0.5 * starts[:, 3], atol=1e-5)
 
 
+@pytest.mark.long
 def test_the_default_model_off_the_couplings_is_that_of_a_period():
     """Where they are off, as in closed loops, their forces differ from one physics step to the
     next: one step's model taken several times had a radius of 2.8 in place of 1.03."""

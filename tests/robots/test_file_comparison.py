@@ -358,6 +358,7 @@ def test_couplings_are_simulated_right(name):
     assert robot.report().left_out == () and gap(model, robot) < 1e-7
 
 
+@pytest.mark.long
 @pytest.mark.compared
 @pytest.mark.parametrize("name", quick_first(NAMED, QUICK_NAMED))
 def test_what_mjx_drops_is_named(name):

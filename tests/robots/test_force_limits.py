@@ -64,6 +64,7 @@ def test_rows_are_the_forces_of_the_c_engine():
     assert max(found[1] for found in about) > 0.1
 
 
+@pytest.mark.long
 def test_a_robot_without_such_limits_has_no_rows():
     robot = jm.load_robot("joint")
     assert force_limits(robot, robot.home, np.zeros(1)) is None

@@ -228,6 +228,7 @@ class TestClosedLoops:
         mujoco.mj_forward(robot.mujoco, data)
         return data.site_xpos[0, 2]
 
+    @pytest.mark.long
     def test_bad_arguments(self, arm, x64):
         robot, mpc, x0, u0, aim = arm
         with pytest.raises(ValueError, match="tasks: given with linearize='state'"):

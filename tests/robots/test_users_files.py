@@ -72,6 +72,7 @@ def test_limits_of_a_urdf_that_no_motion_keeps_are_refused(tmp_path, given, word
         jm.load_robot(path)
 
 
+@pytest.mark.long
 def test_contacts_are_left_out_on_request(tmp_path):
     """What is left falls freely; and where many meshes could touch, a warning names that."""
     body = """<body pos="0 0 {}"><joint type="slide" range="-9 9"/><geom type="mesh" mesh="m"/>

@@ -123,6 +123,7 @@ def test_robust_control_invariant_sets():
         assert bottom <= top + 1e-9
 
 
+@pytest.mark.long
 def test_empty_and_flat_sets_are_reported():
     far = LinearSystem([[1.0]], [[1.0]], c=[2.0])
     found = maximal_control_invariant_set(far, symmetric(5), symmetric(1))

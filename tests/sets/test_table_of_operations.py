@@ -230,6 +230,7 @@ def directions(name, unit):
     return np.array(DIRECTIONS, float) / [1.0 if axis is None else unit[axis] for axis in axes]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("kind", "shape", "unit"), CASES)
 def test_sets_that_operations_return(kind, shape, unit):
     make, intervals, unit = KINDS[kind], SHAPES[shape], np.array(UNITS[unit])

@@ -30,6 +30,7 @@ def derivative():
         return jax.tree.map(np.asarray, jax.jit(both)(*DATA))
 
 
+@pytest.mark.long
 def test_value_in_a_trace(derivative):
     (P, K), _ = derivative
     assert P.dtype == np.float64
@@ -77,6 +78,7 @@ def test_derivative_by_scipys_lyapunov_equation(derivative):
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
 
 
+@pytest.mark.long
 def test_batch_with_members_that_cannot_be_stabilised():
     """B = 0 on an unstable mode, or Q = 0 on a mode of size one: NaN, and no neighbour minds."""
     As = np.array([np.diag([1.2, 0.5]), np.diag([1.2, 0.5]), np.diag([1.0, 0.5])])
@@ -119,6 +121,7 @@ def test_terminal_cost_follows_the_weights_in_a_trace():
         jax.jit(make_mpc)({"Q": np.eye(3), "R": R})
 
 
+@pytest.mark.long
 def test_invariant_ellipsoid_follows_the_weights_of_its_law():
     """Level and contraction in a trace as on the host, the level's derivative by differences."""
     joint = jm.LinearSystem(np.array([[1, 0.01], [0, 1]]), np.array([[0.0], [0.2]]))

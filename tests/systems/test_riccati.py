@@ -73,6 +73,7 @@ def test_lqr_satisfies_the_riccati_equation(seed):
     assert cost == pytest.approx(x0 @ law.P @ x0, rel=1e-10)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["random", "chain", "unmoved", "unseen"])
 def test_units_decide_nothing(kind):
     """States, inputs and cost in units up to 2^40 apart: the same law, or the same error; the

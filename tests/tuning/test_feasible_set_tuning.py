@@ -55,6 +55,7 @@ def fraction():
     return evaluate
 
 
+@pytest.mark.long
 def test_gradient_by_central_differences(fraction):
     _, gradient, _ = fraction(POINT)
     for i, step in enumerate([1e-2, 1e-2, 1e-3, 1e-5, 1e-6, 1e-6, 1e-6]):
@@ -63,6 +64,7 @@ def test_gradient_by_central_differences(fraction):
         np.testing.assert_allclose(gradient[i], expected, rtol=1e-4, err_msg=str(i))
 
 
+@pytest.mark.long
 @jax.enable_x64(True)
 def test_second_derivatives_by_central_differences():
     """The minimiser follows the data: as a constant it left Hessians that were off by 14 times."""

@@ -71,6 +71,7 @@ def start(layer):
     return jax.jit(jax.vmap(layer.start, (None, 0)))
 
 
+@pytest.mark.long
 def test_derivatives_are_those_of_differences(layer, lesson, start, x64):
     """Of a loss over states at which inputs, and soft rows, are at their limits."""
     x = jnp.array([[-0.7, -0.4], [0.85, 0.3], [0.2, 0.1], [0.55, 0.9]])
@@ -177,6 +178,7 @@ def test_the_terminal_weight_follows_what_is_learned(x64):
         jm.tuning.MPCLayer(MPC, "Q", terminal_weight="Q")
 
 
+@pytest.mark.long
 def test_a_closed_loop_carries_its_plans(layer, lesson, start, x64):
     theta, x = layer.init(), np.array([[0.8, 0.0], [-0.8, 0.0], [0.5, 0.1], [0.7, -0.1]])
     first, before = x, start(theta, x)

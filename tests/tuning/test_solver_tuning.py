@@ -62,6 +62,7 @@ def test_more_states_are_solved_on_others(learned):
     assert found.history.best > 0 and np.isfinite(found.history.loss).all()
 
 
+@pytest.mark.long
 def test_gradient_against_differences():
     """Of the loss with respect to log rho and alpha, with warm starts and a reference."""
     rng = np.random.default_rng(0)
@@ -120,6 +121,7 @@ def test_sabotaged_learning_returns_the_given_solver(learned, rate):
     assert found.after == found.before == learned[0].after
 
 
+@pytest.mark.long
 def test_cache(learned, monkeypatch):
     found, folder = learned
     again = lambda **more: (
@@ -146,6 +148,7 @@ def test_cache(learned, monkeypatch):
         assert again().alpha == found.solver.alpha and not calls
 
 
+@pytest.mark.long
 def test_an_interrupt_gives_the_best_so_far_and_no_cache(learned, tmp_path, monkeypatch):
     """Ctrl-C in the fourth gradient: the run of three steps, on hand in the exception."""
     program, calls = loss_and_gradient(), []
@@ -254,6 +257,7 @@ def test_bad_input(settings, match):
         tune_solver(settings.pop("mpc"), settings.pop("x0s"), **settings)
 
 
+@pytest.mark.long
 def test_units_play_no_part():
     """The problem in other units of states, inputs and cost has the same penalties."""
     size, unit, cost = np.array([2.0**-18, 2.0**8]), 2.0**15, 2.0**4

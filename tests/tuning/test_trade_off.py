@@ -45,6 +45,7 @@ def distance(end):
     return lambda run: jnp.sum((run.states[-1] - end) ** 2)
 
 
+@pytest.mark.long
 def test_the_front_of_two_distances_is_known(tmp_path, monkeypatch):
     """The least of w |x − a|² + (1 − w) |x − b|² is at w a + (1 − w) b: there the losses are
     (1 − w)² d² and w² d², d = |a − b| = 5; Gauss-Newton steps are exact."""
@@ -117,6 +118,7 @@ def start_at(goal, **more):
     return tune_weights(lambda v: LAW, parameters, NEXT, STARTS, well, 2, **more)
 
 
+@pytest.mark.long
 def test_the_best_of_several_starting_points(tmp_path, monkeypatch):
     """The start comes to a minimum that is not the least; the second of the others does, by the
     steps that it takes alone."""

@@ -70,6 +70,7 @@ def tuned(x64, make):
     return tune(make=make, loss=LOSS, updates=12, batch=8, optimizer=optax.adam(0.2))
 
 
+@pytest.mark.long
 def test_validation_loss_falls_and_is_that_of_the_returned_values(tuned):
     history = tuned.history
     assert tuned.improvement > 0.2 and history.accepted.all()

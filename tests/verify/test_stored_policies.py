@@ -43,6 +43,7 @@ def written(path, mpc, change=lambda arrays: None):
     return labels
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("policy", ["affine", "tube"])
 @pytest.mark.parametrize("rounds", [8, 1])
 @pytest.mark.first(1)
@@ -73,6 +74,7 @@ MORE = [
 ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("policy", "fields"), MORE)
 @pytest.mark.first(1)
 def test_proves_labels_of_rates_and_blocks(tmp_path, policy, fields):
@@ -89,6 +91,7 @@ def test_proves_labels_of_rates_and_blocks(tmp_path, policy, fields):
     assert result.verified == result.exactly == np.count_nonzero(label)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("policy", "unit"), [("tube", 1.0), ("affine", 1.0), ("affine", 2.0**-40)])
 @pytest.mark.first(1)
 def test_finds_what_is_wrong(tmp_path, policy, unit, monkeypatch):

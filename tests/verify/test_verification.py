@@ -101,6 +101,7 @@ FAST = ("projection",)
 NAMES = [v if v in FAST else pytest.param(v, marks=pytest.mark.slow) for v in PROBLEMS]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", NAMES)
 def test_proves_all_labels(tmp_path, name):
     problem, axes, fixed = PROBLEMS[name]
@@ -148,6 +149,7 @@ def test_rows_that_bound_an_input_alone():
     assert found == [(0, 0, -np.inf, 3.0), (2, 0, -np.inf, 3.0)]
 
 
+@pytest.mark.long
 def test_an_empty_set(tmp_path):
     """No state at all has a plan: the half-space 0'x ≤ b, b < 0, says so."""
     problem = mpc(terminal_set=jm.Box([5.0, 5.0], [6.0, 6.0]))
@@ -221,6 +223,7 @@ class TestFindsWhatIsWrong:
         found = tampered(path, tmp_path / "a.zarr", "plan", beside)
         assert len(found.failures) == np.sum(labels.label == 1) > 5
 
+    @pytest.mark.long
     def test_labels(self, sound, tmp_path):
         """Each of ten flipped labels, and no other."""
         where = np.random.default_rng(0).choice(240, 10, replace=False)
@@ -288,6 +291,7 @@ def test_what_holds_no_map(tmp_path):
         verify_map(tmp_path)
 
 
+@pytest.mark.long
 def test_a_map_made_from_python_is_verified(tmp_path, capsys):
     """Its configuration names no system: the problem is the stored one."""
     jm.feasible.sweep_into(tmp_path / "map.zarr", mpc(), [np.linspace(-1, 1, 4)] * 2)

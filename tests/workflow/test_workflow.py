@@ -101,6 +101,7 @@ def test_report_keeps_to_its_time(capsys):
         assert any(stage in line for line in lines)
 
 
+@pytest.mark.long
 def test_a_report_of_a_robust_problem_says_against_what():
     mpc = replace(problems.joint(3), disturbance=jm.Box(-0.001, 0.001), policy="affine")
     text = str(jm.workflow.offline_report(mpc, seconds=0.01))
@@ -109,6 +110,7 @@ def test_a_report_of_a_robust_problem_says_against_what():
     assert "Theorem 3 is about w = 0" in text
 
 
+@pytest.mark.long
 def test_costs_in_other_units_decrease_as_much():
     """Of an unstable system without a terminal cost, whose cost may grow."""
     system = jm.LinearSystem([[1.2, 1], [0, 1.1]], [[0.5], [1]], dt=1.0)
