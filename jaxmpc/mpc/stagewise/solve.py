@@ -13,10 +13,11 @@ the same recursion without penalties u_k = K x_k + e_k with e_k of covariance G�
 runs forward, Σ⁺ = (A + BK) Σ (A + BK)' + B G⁻¹ B' from Σ_0 = 0.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -83,7 +84,7 @@ ADMM_STEPS = 20
 # ADMM.newton_steps is None.
 NEWTON_STEPS = 6
 MOST_STEPS = 2 * NEWTON_STEPS + INTERIOR_STEPS
-# How much farther than under the gain a state may move without it: some digits of predictions.
+# Growth of states over the horizon from which on the variables are moves: two digits of them.
 GROWTH = 100.0
 
 
@@ -196,8 +197,8 @@ class StageFactor:
 def _factor(mpc: MPC, rho: Any, scale: Any, steps: bool) -> StageFactor:
     s, fault = cleaned(Stages.of(mpc))
     if scale is None:
-        motion = FreeMotion.of(s)
-        E, s = row_scale(s, motion), replace(s, gain=stabilising_gain(s, motion))
+        free = riccati(s)
+        E, s = row_scale(s, free), replace(s, gain=stabilising_gain(s, free))
     else:
         E = jnp.asarray(scale, s.Q.dtype)
     inputs = s.horizon * s.B.shape[-1]
@@ -211,38 +212,30 @@ def _factor(mpc: MPC, rho: Any, scale: Any, steps: bool) -> StageFactor:
     return StageFactor(replace(s, gain=gain), E, rho, gains, fault)
 
 
-class FreeMotion(NamedTuple):
-    """How inputs move without rows: gains, and under exp(−J) the covariance that each adds to the
-    next state, noise (N, n, n), and that of all states, Sigma (N+1, n, n)."""
-
-    gains: Gains
-    noise: Array
-    Sigma: Array
-
-    @classmethod
-    def of(cls, s: Stages) -> "FreeMotion":
-        """Return that of stages."""
-        gains = riccati(s)
-        noise = matmul(s.B, matmul(gains.inverse, jnp.swapaxes(s.B, -1, -2)))
-        Sigma = covariances(gains.closed, noise)
-        return cls(gains, noise, jnp.concatenate([jnp.zeros_like(s.P)[None], Sigma]))
-
-
-def stabilising_gain(s: Stages, motion: FreeMotion) -> Array:
-    """Return K (N, m, n), that of least cost without rows where the same inputs would move a state
-    GROWTH times as far without it, and else zero. What the plan is does not depend on it, hence it
-    has no derivative."""
-    K, noise, Sigma = jax.lax.stop_gradient((motion.gains.K, motion.noise, motion.Sigma[1:]))
-    A = jnp.broadcast_to(jax.lax.stop_gradient(s.A), Sigma.shape)
-    alone = covariances(A, noise)
-    variances = (jnp.diagonal(V, axis1=-2, axis2=-1) for V in (alone, GROWTH**2 * Sigma))
-    open_loop, most = variances
-    return jnp.where(jnp.any(~(open_loop <= most)), K, 0.0)
+def stabilising_gain(s: Stages, gains: Gains) -> Array:
+    """Return the gain of least cost without rows, of the first stage where the system is the same
+    at all, if the states would grow GROWTH-fold without it, and else zero. What the plan is does
+    not depend on it, hence it has no derivative."""
+    A, K = jax.lax.stop_gradient((s.A, gains.K))
+    if A.ndim == 2:
+        powers = [A]
+        for _ in range(math.ceil(math.log2(s.horizon))):
+            powers.append(matmul(powers[-1], powers[-1]))
+        products = jnp.stack(powers)
+    else:
+        step = lambda product, A: (matmul(A, product),) * 2
+        products = jax.lax.scan(step, varying(jnp.eye(A.shape[-1], dtype=A.dtype), A), A)[1]
+    # n at most where nothing grows, and the same in all coordinates of the states.
+    traces = jnp.abs(jnp.trace(products, axis1=-2, axis2=-1))
+    grows = ~jnp.all(traces <= GROWTH * A.shape[-1])  # also where they overflow
+    return jnp.where(grows, K[0] if A.ndim == 2 and s.B.ndim == 2 else K, 0.0)
 
 
-def row_scale(s: Stages, motion: FreeMotion) -> Array:
-    """E (rows,): 1/E² is the variance of the row under exp(−J); 0 where that is zero."""
-    gains, _, Sigma = motion
+def row_scale(s: Stages, gains: Gains) -> Array:
+    """E (rows,): 1/E² is the variance of the row under exp(−J); 0 where that is zero. gains: those
+    of s without weights on rows."""
+    spread = matmul(s.B, matmul(gains.inverse, jnp.swapaxes(s.B, -1, -2)))
+    Sigma = jnp.concatenate([jnp.zeros_like(s.P)[None], covariances(gains.closed, spread)])
     variance, own = [jnp.zeros(0, s.Q.dtype)], [jnp.zeros(0, s.Q.dtype)]
     square = lambda M, V: jnp.sum(matmul(M, V) * M, axis=-1)
     deviation = lambda V: jnp.sqrt(jnp.maximum(jnp.diagonal(V, axis1=-2, axis2=-1), 0.0))

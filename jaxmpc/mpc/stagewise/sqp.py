@@ -49,7 +49,6 @@ from jaxmpc.mpc.stagewise.nonlinear import (
 from jaxmpc.mpc.stagewise.recursion_kernels import recurrence
 from jaxmpc.mpc.stagewise.solve import (
     NEWTON_STEPS,
-    FreeMotion,
     StageFactor,
     checked,
     full_aim,
@@ -282,7 +281,7 @@ def with_tasks(plan: Plan, s: Stages, base: Stages, problem: NonlinearMPC, x: Ar
 
 def scales(s: Stages, scale: Array | None) -> tuple[Array, Array]:
     """Return the row scale E (rows,) and the penalty ρ (rows,) of the expansion."""
-    E = row_scale(s, FreeMotion.of(s)) if scale is None else jnp.asarray(scale, s.P.dtype)
+    E = row_scale(s, riccati(s)) if scale is None else jnp.asarray(scale, s.P.dtype)
     rho = default_rho(E, s.horizon * s.B.shape[-1])
     return E, jnp.broadcast_to(rho, E.shape)
 

@@ -69,8 +69,8 @@ class Stages:
     zero.
     blocks, bounds: the rows of `rows.blocks`, and what is asked of all of them (rows,). aim: where
     a plan begins and what it tracks, with full references; none of it until it is known.
-    remembers: whether the state is (x_k, u_{k−1}), and n its size. gain K (N, m, n): plans are
-    moves v, the inputs u = K x + v; None: they are the inputs.
+    remembers: whether the state is (x_k, u_{k−1}), and n its size. gain K (m, n) or (N, m, n):
+    plans are moves v, the inputs u = K x + v; None: they are the inputs.
     """
 
     A: Array
@@ -122,7 +122,7 @@ class Stages:
 
     @property
     def closed(self) -> Array:
-        """The matrix from a state to the next at fixed moves, A or A + BK (N, n, n)."""
+        """The matrix from a state to the next at fixed moves, A or A + BK."""
         return self.A if self.gain is None else self.A + matmul(self.B, self.gain)
 
     def inputs(self, x: Array, v: Array) -> Array:
@@ -136,7 +136,9 @@ class Stages:
     def at_fixed_moves(self, gx: Array, gu: Array) -> Array:
         """Return the gradient in x (N+1, n) at fixed moves of a function of x and u whose
         gradients in these are gx (N+1, n) and gu (N, m)."""
-        return gx if self.gain is None else gx.at[:-1].add(apply_transposed(self.gain, gu))
+        if self.gain is None:
+            return gx
+        return gx + jnp.pad(apply_transposed(self.gain, gu), ((0, 1), (0, 0)))
 
     @property
     def layout(self) -> Layout:
@@ -344,7 +346,7 @@ def conditions(s: Stages, v: Array, y: Array) -> Optimality:
     u = s.inputs(x, v)
     (gx, own), (px, pushed) = s.gradient(x, u), s.pull(y)
     # Of cost and rows apart: at the solution their sum is small, its rounding is that of the parts.
-    both = jnp.stack([s.at_fixed_moves(gx, own), s.at_fixed_moves(px, pushed)])
+    both = jax.vmap(s.at_fixed_moves)(jnp.stack([gx, px]), jnp.stack([own, pushed]))
     back = jax.vmap(lambda g: recurrence(s.closed, g[:-1], g[-1], adjoint=True))(both)
     of_cost, of_rows = jnp.concatenate([back[:, 1:], both[:, -1:]], axis=1)
     absolute = jax.tree.map(jnp.abs, replace(s, bounds=Bounds(s.bounds.l, s.bounds.u)))
@@ -354,9 +356,9 @@ def conditions(s: Stages, v: Array, y: Array) -> Optimality:
     # Its gradient, of the terms of its distance from the reference, and of slopes.
     far = absolute.aim._replace(states=-absolute.aim.states, inputs=-absolute.aim.inputs)
     weighed, own_terms = replace(absolute, aim=far).gradient(terms, jnp.abs(u))
-    later = jax.lax.cumsum(absolute.at_fixed_moves(weighed, own_terms)[1:], reverse=True)
+    later = jax.lax.cumsum(weighed[1:], reverse=True)
     # The rounding of a costate is that of others too, as of a speed's that of its position.
-    later = later + apply_transposed(absolute.closed, later)
+    later = later + apply_transposed(absolute.A, later)
     back_terms = later + jnp.abs(of_cost) + jnp.abs(of_rows)
     cost_part = jnp.abs(own) + apply_transposed(absolute.B, jnp.abs(of_cost))
     row_part = jnp.abs(pushed + apply_transposed(s.B, of_rows))
