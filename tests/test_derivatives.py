@@ -2,8 +2,9 @@
 
 All numbers that a function takes move at once, each along a random direction of its own, by t. What
 it gives is one number F(t) of all its results. F'(t) by reverse and by forward mode, and F''(t),
-forward over reverse, are compared with differences of F and of F'. Nothing here knows how the
-derivatives are made: a part of the data that they take for constant is found.
+forward and reverse over reverse and reverse over forward, are compared with differences of F and of
+F'. Nothing here knows how the derivatives are made: a part of the data that they take for constant
+is found.
 """
 
 from dataclasses import replace
@@ -248,3 +249,6 @@ def test_derivatives_of_all_data_at_once(name):
         np.testing.assert_allclose(forward, reverse, rtol=1e-8, atol=1e-10)
         np.testing.assert_allclose(reverse, difference(value), rtol=1e-6, atol=1e-8)
         np.testing.assert_allclose(second, difference(slope), rtol=1e-5, atol=1e-7)
+        for backward in (slope, lambda t: along(function)(t)[1]):
+            again = jax.jit(jax.grad(backward))(0.02)
+            np.testing.assert_allclose(again, second, rtol=1e-7, atol=1e-9)

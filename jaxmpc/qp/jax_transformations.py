@@ -28,7 +28,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 from jax.custom_batching import custom_vmap
-from jax.extend.core import ClosedJaxpr
+from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
+from jax.interpreters import ad, batching, mlir
 from jax.sharding import (
     AbstractMesh,
     AxisType,
@@ -325,13 +326,71 @@ def kept_whole(function: Callable[..., R]) -> Callable[..., R]:
     """Return a function that has rules of derivatives, as one which keeps them.
 
     Where a loop is linearised, as for reverse mode, JAX below 0.12 forgets the rules of what it
-    computes before: derivatives of these derivatives would be those of the function as written."""
+    computes before: derivatives of these derivatives would be those of the function as written. An
+    operation of its own is not taken apart. (One with a rule of batching alone is not either, but
+    a derivative of that is one operation too, which reverse mode cannot divide.) Its derivative is
+    that of the function, whose rule has to call it in turn for its results.
+    """
 
-    def rule(size: int, in_batched: tuple, *arguments: Any) -> R:
-        axes = jax.tree.map(lambda b: 0 if b else None, in_batched)
-        return jax.vmap(function, in_axes=axes, axis_size=size)(*arguments)
+    def call(*arguments: Any) -> R:
+        leaves, tree = jax.tree.flatten(arguments)
+        if concrete(leaves):
+            return function(*arguments)
+        flat = lambda *leaves: function(*jax.tree.unflatten(tree, leaves))
+        program, shapes = jax.make_jaxpr(flat, return_shape=True)(*leaves)
+        return jax.tree.unflatten(jax.tree.structure(shapes), _whole(program, leaves))
 
-    return batched_by(rule, function)
+    return call
+
+
+whole_p = Primitive("kept_whole")
+whole_p.multiple_results = True
+
+
+def _whole(program: ClosedJaxpr, arguments: Any) -> list[Array]:
+    # What the function closes over may be traced: arguments too.
+    names = [*program.jaxpr.constvars, *program.jaxpr.invars]
+    jaxpr = program.jaxpr.replace(
+        constvars=[], invars=names, debug_info=program.jaxpr.debug_info.with_unknown_names()
+    )
+    return whole_p.bind(*program.consts, *arguments, program=ClosedJaxpr(jaxpr, ()))
+
+
+@whole_p.def_impl
+def _run_whole(*arguments: Array, program: ClosedJaxpr) -> list[Array]:
+    return jaxpr_as_fun(program)(*arguments)
+
+
+@whole_p.def_abstract_eval
+def _(*arguments: Any, program: ClosedJaxpr) -> Any:
+    return program.out_avals
+
+
+def _moved_whole(primals: Any, tangents: Any, *, program: ClosedJaxpr) -> tuple[Any, Any]:
+    """Return the results and their derivatives, by the function's own rule."""
+    moving = [i for i, v in enumerate(tangents) if type(v) is not ad.Zero]
+
+    def run(*moved: Array) -> list[Array]:
+        given = list(primals)
+        for i, v in zip(moving, moved, strict=True):
+            given[i] = v
+        return jaxpr_as_fun(program)(*given)
+
+    pick = lambda values: tuple(values[i] for i in moving)
+    found, change = jax.jvp(run, pick(primals), pick(tangents))
+    still = lambda v: v.dtype == jax.dtypes.float0
+    return found, [ad.Zero(jax.typeof(v)) if still(v) else v for v in change]
+
+
+def _batched_whole(arguments: Any, axes: Any, *, program: ClosedJaxpr) -> tuple[Any, Any]:
+    run = jax.vmap(jaxpr_as_fun(program), in_axes=tuple(axes))
+    out = _whole(jax.make_jaxpr(run)(*arguments), arguments)
+    return out, [0] * len(out)
+
+
+ad.primitive_jvps[whole_p] = _moved_whole
+batching.primitive_batchers[whole_p] = _batched_whole
+mlir.register_lowering(whole_p, mlir.lower_fun(_run_whole, multiple_results=True))
 
 
 def in_blocks(

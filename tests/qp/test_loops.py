@@ -15,6 +15,7 @@ from jaxmpc.qp.jax_transformations import (
     attempted_first,
     group_sizes,
     in_blocks,
+    kept_whole,
     repeat_while,
     true_places,
 )
@@ -227,3 +228,46 @@ def test_an_answer_is_its_own_in_any_batch():
             assert one.status == many.status[i]
             if one.status == jm.Status.SOLVED:
                 np.testing.assert_allclose(many.z[i], one.z, atol=1e-9)
+
+
+def sine_by_its_rule(again):
+    """Return sin, constant but for its rule, which is made of sin once more."""
+    f = jax.custom_jvp(lambda x: jax.lax.stop_gradient(jnp.sin(x)))
+
+    @f.defjvp
+    def _(primals, tangents):
+        # sin x once more, of which the derivative of this derivative is made.
+        y = again(f)(*primals)
+        return y, jnp.cos(jnp.arcsin(y)) * tangents[0]
+
+    return f
+
+
+@pytest.mark.parametrize("batched", [False, True])
+def test_rules_are_kept_in_loops_in_all_modes(batched):
+    """sin'' of a function whose own derivative is 0: known through its rule alone. In a loop, which
+    JAX below 0.12 linearises without the rules of what is known before."""
+    f, scale = sine_by_its_rule(kept_whole), jnp.array([1.0, 0.5])
+
+    def loop(x):
+        def step(total, k):
+            # What the function closes over is traced too.
+            moved = kept_whole(lambda y: f(y) + 0 * x)(x / (k + 1.0))
+            return total + moved, None
+
+        return jnp.sum(jax.lax.scan(step, 0 * x, jnp.arange(2))[0])
+
+    one = lambda x: jnp.sum(jax.vmap(loop)(x * scale)) if batched else loop(x)
+    known = lambda x: -jnp.sin(x) - jnp.sin(x / 2) / 4
+    at = 0.7
+    expected = known(at) + (known(at / 2) / 4 if batched else 0)
+    modes = {
+        "reverse, reverse": jax.grad(jax.grad(one)),
+        "forward, reverse": jax.jacfwd(jax.grad(one)),
+        "reverse, forward": jax.grad(jax.jacfwd(one)),
+        "forward, forward": jax.jacfwd(jax.jacfwd(one)),
+    }
+    found = {name: float(mode(at)) for name, mode in modes.items()}
+    np.testing.assert_allclose(list(found.values()), expected, rtol=1e-5, err_msg=str(found))
+    jitted = [float(jax.jit(mode)(at)) for mode in modes.values()]
+    np.testing.assert_allclose(jitted, expected, rtol=1e-5)

@@ -1,5 +1,7 @@
 """`lqr` inside a trace: its value, and its derivative with respect to A, B, Q and R."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -187,3 +189,15 @@ def test_cost_of_a_law():
     assert np.isnan(traced[1]).all()
     with pytest.raises(ValueError, match="K: A \\+ BK has spectral radius"):
         cost_of_law(jm.LinearSystem(A, B), -3 * K, Q, R)
+
+
+def test_second_derivatives_in_all_modes():
+    """Reverse over another mode was an error of JAX."""
+    A, B = np.array([[1.1, 0.1], [0.0, 1.2]]), np.array([[0.0], [1.0]])
+    gain = lambda t: jnp.sum(jm.lqr(jm.LinearSystem(A * (1 + t), B), jnp.eye(2), jnp.eye(1)).K ** 2)
+    with jax.enable_x64(True):
+        slope = jax.jit(jax.grad(gain))
+        expected = (float(slope(1e-4)) - float(slope(-1e-4))) / 2e-4
+        for one, other in itertools.product((jax.jacrev, jax.jacfwd), repeat=2):
+            found = float(jax.jit(one(other(gain)))(0.0))
+            np.testing.assert_allclose(found, expected, rtol=1e-5)
