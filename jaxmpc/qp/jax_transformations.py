@@ -212,7 +212,7 @@ def with_derivative_of(slow: Callable[..., R], fast: Callable[..., R]) -> Callab
     @found.defjvp
     @own_modes
     def _(primals: tuple, tangents: tuple) -> tuple[R, R]:
-        return found(*primals), jax.jvp(slow, primals, tangents)[1]
+        return kept_whole(found)(*primals), jax.jvp(slow, primals, tangents)[1]
 
     return found
 
