@@ -68,7 +68,7 @@ def evaluate_runs(
     if not tolerance > 0:
         fail("tolerance", f"{tolerance}", "Give a positive fraction")
     limits = with_limits(plant, run)
-    xi, band = limits[0][1], tolerance * plant.state_limits.half_widths()
+    xi, band = limits[0][1], tolerance * np.asarray(plant.state_limits.half_widths())
     if isinstance(plant, Robot):
         lower, upper = plant.state_limits.bounds()
         velocities = np.arange(plant.n) >= plant.mujoco.nv

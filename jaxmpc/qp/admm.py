@@ -79,7 +79,7 @@ class ADMM:
     alpha: over-relaxation in (0, 2).
     newton_steps: at most so many after the loop, 0 for none (`dual.py`, `newton.py`). None:
     1,000, of which badly scaled linear programs need most, 150 where every instance takes them all,
-    and in `solve_stagewise` as many as are needed. An instance leaves when its residuals are small
+    and 72 in `solve_stagewise`. An instance leaves when its residuals are small
     enough, also in a batch. fixed: every instance takes all `newton_steps`, of the method of
     multipliers: constant time; so do unrolled derivatives. dtype: floating type of ADMM's iterates,
     "float32" or "float64"; None: float32 before Newton steps, that of the data without any. Newton

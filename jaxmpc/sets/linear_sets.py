@@ -689,12 +689,15 @@ class Box(LinearSet):
         half = np.where(np.isfinite(upper - lower), upper - lower, 0.0) / 2
         return Box(lower + fraction * half, upper - fraction * half)
 
-    def half_widths(self) -> np.ndarray:
+    def half_widths(self) -> AnyArray:
         """Return half the distance between the two ends of each coordinate, (n,); 1 where an end
-        is infinite or both coincide. It is the unit of weights and tolerances."""
-        lower, upper = self.spread(1).bounds()
-        width = (upper - lower) / 2
-        return np.where(np.isfinite(width) & (width > 0), width, 1.0)
+        is infinite or both coincide. It is the unit of weights and tolerances. Traceable."""
+        self = self.spread(1)
+        xp, (lower, upper) = numbers(self.lower, self.upper)
+        # Infinite ends have no derivative, not NaN.
+        finite = xp.isfinite(lower) & xp.isfinite(upper)
+        low, high = (xp.where(finite, end, 0.0) for end in (lower, upper))
+        return xp.where(high > low, (high - low) / 2, 1.0)
 
     def rows(self) -> tuple[AnyArray, AnyArray, AnyArray]:
         """Return (H, lower, upper) of the two-sided rows lower <= H x <= upper; H is the

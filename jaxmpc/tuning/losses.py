@@ -36,14 +36,6 @@ def _counts(weight: Any) -> bool:
     return not concrete(weight) or bool(weight)
 
 
-def _widths(box: Box) -> Array:
-    """Return the half-widths of a box, 1 where they are 0 or infinite."""
-    ends = jnp.asarray(box.lower), jnp.asarray(box.upper)
-    finite = jnp.isfinite(ends[0]) & jnp.isfinite(ends[1])
-    low, high = (jnp.where(finite, end, 0.0) for end in ends)
-    return jnp.where(high > low, (high - low) / 2, 1.0)
-
-
 @record
 class ClosedLoopLoss:
     """Loss of one closed loop: tracking, effort, violations and time to settle,
@@ -141,7 +133,8 @@ class ClosedLoopLoss:
     def excess(self, x: Array) -> Array:
         """Return by how much the states x (T+1, n) violate each row of the limits, (T+1, rows)."""
         limits = jax.tree.map(lambda v: jnp.asarray(v, x.dtype), self.limits)
-        return row_violations(limits, x) / (_widths(limits) if isinstance(limits, Box) else 1.0)
+        units = limits.half_widths() if isinstance(limits, Box) else 1.0
+        return row_violations(limits, x) / units
 
     def worst(self, run: Run) -> Array:
         """Return the largest violation of a run."""
