@@ -3,9 +3,10 @@
     python experiments/unstable.py
 
 Random systems whose states grow by a factor at each step in open loop, in coordinates that may
-nearly coincide; soft limits of states, hard ones of inputs, which hold some of the systems nowhere
-near the origin: their states leave for good, and no plan of these is exact in float64. "solved" are
-those of `jm.solve` and `solve_stagewise`, "cost" is the greatest relative difference of the two.
+nearly coincide; soft limits of states, hard ones of inputs. Within the latter nothing keeps some of
+these systems near the origin: their states grow over the horizon, and their plans are not solved.
+"solved" are those of `jm.solve` and `solve_stagewise`, "cost" is the greatest relative difference
+of the two.
 """
 
 from dataclasses import dataclass, replace
