@@ -117,8 +117,9 @@ def solve_stagewise(
     Predictions of unstable systems lose no digits: their variables are v, with inputs u = K x + v
     by the gains of least cost without rows (mpc.prestabilise is not read).
     scale (rows,): the row scale of a similar problem (`factor_stages(...).E`), which saves a
-    Riccati recursion, and with it these gains; it changes the path, not the answer. A row of scale
-    0 counts as one that no input moves: where that is not so, the plan does not become SOLVED.
+    Riccati recursion; it changes the path, not the answer. Without that recursion there is no K:
+    give no scale for a system that grows 1e5-fold over the horizon. A row of scale 0 counts as one
+    that no input moves: where that is not so, the plan does not become SOLVED.
 
     Disturbances: with policy="tightened" as above. With "affine" (a Box, or a Zonotope of
     independent generators) plan.feedback is M, found together with the plan by an interior point
