@@ -79,11 +79,11 @@ class ADMM:
     alpha: over-relaxation in (0, 2).
     newton_steps: at most so many after the loop, 0 for none (`dual.py`, `newton.py`). None:
     1,000, of which badly scaled linear programs need most, 150 where every instance takes them all,
-    and 72 in `solve_stagewise`. An instance leaves when its residuals are small
-    enough, also in a batch. fixed: every instance takes all `newton_steps`, of the method of
-    multipliers: constant time; so do unrolled derivatives. dtype: floating type of ADMM's iterates,
-    "float32" or "float64"; None: float32 before Newton steps, that of the data without any. Newton
-    steps are float64 whatever it is, except unrolled ones.
+    and 72 in `solve_stagewise`. An instance leaves when its residuals are small enough, also in a
+    batch. fixed: every instance takes all `newton_steps`, of the method of multipliers: constant
+    time; so do unrolled derivatives. dtype: floating type of ADMM's iterates, "float32" or
+    "float64"; None: float32 before Newton steps, that of the data without any. Newton steps are
+    float64 whatever it is, except unrolled ones.
     eps: tolerance of status SOLVED, relative: each entry of the primal and of the dual residual,
     and the gap, is at most eps times the size of its terms, Σ_j |A_ij z_j| for row i and
     Σ_j |P_ij z_j| + |q_i| + Σ_j |A_ji y_j| for variable i, or a thousandth of eps times what is

@@ -15,10 +15,10 @@ and the value function ½ x'S x + p'x of the steps after k gives (Rawlings, Mayn
 
 Only p runs backward and only x forward; all else is done for all stages at once.
 
-With a gain the inputs are u_k = K_k x_k + v_k and a plan is its moves v, as `mpc.prestabilise` is
-meant: x follows from v by A + BK, which does not lose the digits that an unstable A does, and so do
-the costates. The problem, its rows and the recursion above stay those in x and u, of which only the
-gradients are taken at fixed v.
+With a gain the inputs are u_k = K_k x_k + v_k and a plan is its moves v, the substitution of
+`mpc.prestabilise`: x follows from v by A + BK, which does not lose the digits that an unstable A
+does, and so do the costates. The problem, its rows and the recursion above stay those in x and u;
+only gradients are taken at fixed v.
 
 Where input rates are limited or weighed, the state here is (x_k, u_{k−1}), x_0 followed by u_{−1}:
 A and B get m more rows, u_k = u_k, the rate u_k − u_{k−1} is a row in state and input, and its cost
@@ -409,11 +409,10 @@ def residuals_of(s: Stages, E: Array, v: Array, y: Array, found: Optimality) -> 
     size = jnp.minimum(size, 2 * (found.cost_size + jnp.sum(penalty)))
 
     def most(values: Array) -> Array:
+        most_of = lambda part: jnp.max(part, axis=0, initial=0.0)
         parts = split(s.layout, values)
-        largest = [jnp.max(part, axis=0, initial=0.0) for part in parts]
-        pairs = zip(parts, largest, strict=True)
-        spread = [jnp.broadcast_to(m, part.shape).ravel() for part, m in pairs]
-        return jnp.concatenate([*spread, values[:0]])
+        parts = [jnp.broadcast_to(most_of(part), part.shape).ravel() for part in parts]
+        return jnp.concatenate([*parts, values[:0]])
 
     known = bounds.sizes()
     row_size = jnp.maximum(known, jnp.abs(found.rows))
