@@ -2,6 +2,7 @@
 differences."""
 
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -480,6 +481,66 @@ def test_plans_without_a_start_are_traced(x64):
     """From any state, under limits of inputs and tasks; values: the slow tests above."""
     plan = jax.eval_shape(lambda x: solve_nonlinear(around(), x, GOAL), START)
     assert plan.inputs.shape == (8, 2)
+
+
+@pytest.mark.parametrize("iterations", [1, 20])
+@pytest.mark.parametrize("warm", [False, True])
+@pytest.mark.parametrize("rates", [False, True])
+def test_plans_of_all_kinds_are_traced(x64, iterations, warm, rates):
+    """One QP about a warm start of a problem with rates, whose stages have a state of their own,
+    was an error of JAX; values: the tests of controllers."""
+    problem = around(rho=5.0)
+    if rates:
+        mpc = replace(problem.mpc, input_rate_limit=0.5, input_rate_weight=[0.1, 0.1])
+        problem = replace(problem, mpc=mpc)
+
+    def again(x):
+        plan = solve_nonlinear(problem, x, GOAL) if warm else None
+        return solve_nonlinear(problem, x, GOAL, warm_start=plan, iterations=iterations)
+
+    assert jax.eval_shape(again, START).inputs.shape == (8, 2)
+
+
+def unstable(as_function, A, B, x):
+    """The first input and the plan of a linear model, as a function or as it is."""
+    n, m = B.shape
+    limits = {"states": jm.Box(-np.full(n, 5.0), 5.0), "inputs": jm.Box(-np.ones(m), 1.0)}
+    system = jm.LinearSystem(A, B)
+    mpc = jm.MPC(system, np.eye(n), np.eye(m), 30, **limits, constrain_initial=False)
+    mpc = jm.soften(mpc, 10.0)
+    if as_function:
+        problem = NonlinearMPC(mpc, lambda x, u: A @ x + B @ u)
+        plan = solve_nonlinear(problem, x, solver=jm.ADMM(eps=1e-10), iterations=2)
+    else:
+        plan = solve_stagewise(mpc, x)
+    return plan.inputs[0, 0], plan
+
+
+@pytest.mark.long
+def test_unstable_models_are_solved_as_linear_ones_are(x64):
+    """Models that grow 3e3- to 1e12-fold over the horizon; those of 1e6 and more were solved
+    nowhere."""
+    rng, n = np.random.default_rng(3), 2
+    growth = np.repeat([1.3, 1.8, 2.5], 8)
+    T = np.eye(n) + rng.uniform(-0.9, 0.9, (len(growth), n, n))
+    values = np.stack([growth, rng.uniform(-1, 1, len(growth)) * growth], axis=1)
+    A = T @ (values[:, :, None] * np.linalg.inv(T))
+    B, x0 = rng.normal(size=(len(growth), n, 1)), rng.normal(size=(len(growth), n))
+
+    planned = jax.value_and_grad(partial(unstable, True), argnums=2, has_aux=True)
+    planned = jax.jit(jax.vmap(planned))
+    (first, found), slopes = planned(A, B, x0)
+    linear = jax.jit(jax.vmap(partial(unstable, False)))(A, B, x0)[1]
+    solved = np.asarray(linear.status) == SOLVED
+    assert solved.sum() >= 12
+    assert np.all(found.status[solved] == SOLVED) and np.all(found.iterations[solved] == 1)
+    np.testing.assert_allclose(found.cost[solved], linear.cost[solved], rtol=2e-6)
+    # Pieces of these laws may be short: on one side at least the difference is of the same piece.
+    for i in range(n):
+        moved = [planned(A, B, x0 + h * np.eye(n)[i])[0][0] for h in (1e-5, -1e-5)]
+        sides = (moved[0] - first) / 1e-5, (first - moved[1]) / 1e-5
+        wrong = np.min(np.abs(np.stack(sides) - slopes[:, i]), axis=0)
+        np.testing.assert_allclose(wrong[solved], 0.0, atol=1e-4)
 
 
 @pytest.mark.slow  # its programs, stage by stage, are those of `test_interior_point.py`

@@ -343,6 +343,9 @@ def _plan(
     s = factor.stages.aimed(aim)
     if answers_disturbances(mpc):
         return affine_plan(mpc, replace(s, gain=None), factor.E, fault, solver, aim, centred)
+    if warm_start is not None:
+        x, u, y = warm_start
+        warm_start = WarmStart(s.joined(x, u), u, y)
     found = stage_solution(factor, s, solver, warm_start)
     found = replace(found, iterations=jnp.int32(solver.admm_steps(ADMM_STEPS)))
     x = predict(s, found.z)
@@ -352,9 +355,10 @@ def _plan(
 def stage_solution(
     factor: StageFactor, s: Stages, solver: ADMM, warm_start: WarmStart | None
 ) -> QPSolution:
-    """Return the solution, moves z (N, m) and multipliers y (rows,), with its status and its
-    derivatives: that of what was measured of the float64 pair that Newton steps end at, before it
-    was rounded, or where there were none of what is measured of this pair."""
+    """Return the solution, moves z (N, m) and multipliers y (rows,), from a warm start in the
+    states of the stages, with its derivatives and its status: that of what was measured of the
+    float64 pair that Newton steps end at, before it was rounded, or where there were none of what
+    is measured of this pair."""
     given = factor, s, solver, warm_start
     if solver.differentiate == "implicit":
         factor, *_ = given = jax.lax.stop_gradient(given)
@@ -379,7 +383,7 @@ def searched(
     if warm_start is not None:  # what is not finite counts as 0
         clean = lambda v: jnp.nan_to_num(jnp.asarray(v, E.dtype), posinf=0.0, neginf=0.0)
         x, u, multipliers = map(clean, warm_start)
-        given = s.moves(s.joined(x, u), u), multipliers
+        given = s.moves(x, u), multipliers
         far = lambda pair: jax.lax.stop_gradient(distance(s, E, rho[-1], *pair))
         near = far(given) <= 100 * far((z, y))
         z, y = (jnp.where(near, v, 0.0) for v in given)

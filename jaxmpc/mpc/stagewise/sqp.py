@@ -53,6 +53,7 @@ from jaxmpc.mpc.stagewise.solve import (
     checked,
     full_aim,
     row_scale,
+    stabilising_gain,
     stage_solution,
 )
 from jaxmpc.mpc.stagewise.stages import (
@@ -209,7 +210,8 @@ def _solve(
         last = repeat_while(lambda state: state.open, step, constants, first, steps="recursion")
         x, u, y, count = last.x, last.u, last.y, last.steps
     s = expanded(base, problem, x, u)
-    E, rho = scales(jax.lax.stop_gradient(s), scale)
+    measured, E, rho = jax.lax.stop_gradient(scaled(s, scale))
+    s = replace(s, gain=measured.gain)
     if iterations == 1:
         gains = None
         if solver.admm_steps():
@@ -217,16 +219,16 @@ def _solve(
         factor = StageFactor(s, E, rho[None], gains, fault)
         found = stage_solution(factor, s, solver, WarmStart(x, u, y))
         x = predict(s, found.z)
+        u = s.inputs(x, found.z)
     else:
-        measured = jax.lax.stop_gradient((s, E))
-        z = jnp.concatenate([predict(measured[0], u).ravel(), u.ravel()])
-        at_solution = jax.lax.stop_gradient((E, rho))
-        z, y = implicit(nonlinear_conditions, (base, problem), at_solution, z, y)
+        moves = measured.moves(x, u)
+        x = predict(measured, moves)
+        z = jnp.concatenate([x.ravel(), measured.inputs(x, moves).ravel()])
+        z, y = implicit(nonlinear_conditions, (base, problem), (E, rho, measured.gain), z, y)
         x, u = _states_inputs(s, z)
         y = s.bounds.following(y, E, s.rows(x, u))
-        found = assess(nonlinear_residuals, measured, u, y, Proof.none(u, y), eps)
+        found = assess(nonlinear_residuals, (measured, E), moves, y, Proof.none(moves, y), eps)
         s = expanded(base, problem, x, u) if problem.tasks else s
-    u = found.z
     found = replace(found, iterations=jnp.asarray(count, jnp.int32))
     plan = answer(mpc, s.layout, found, fault, s.of_system(x), u, aim)
     return with_tasks(plan, s, base, problem, x)
@@ -279,11 +281,16 @@ def with_tasks(plan: Plan, s: Stages, base: Stages, problem: NonlinearMPC, x: Ar
     return replace(plan, cost=J, slack=jnp.concatenate(slack, axis=1))
 
 
-def scales(s: Stages, scale: Array | None) -> tuple[Array, Array]:
-    """Return the row scale E (rows,) and the penalty ρ (rows,) of the expansion."""
-    E = row_scale(s, riccati(s)) if scale is None else jnp.asarray(scale, s.P.dtype)
+def scaled(s: Stages, scale: Array | None) -> tuple[Stages, Array, Array]:
+    """Return the expansion with the gain that its moves have, unless a row scale is given, and the
+    row scale E (rows,) and the penalty ρ (rows,)."""
+    if scale is None:
+        free = riccati(s)
+        E, s = row_scale(s, free), replace(s, gain=stabilising_gain(s, free))
+    else:
+        E = jnp.asarray(scale, s.P.dtype)
     rho = default_rho(E, s.horizon * s.B.shape[-1])
-    return E, jnp.broadcast_to(rho, E.shape)
+    return s, E, jnp.broadcast_to(rho, E.shape)
 
 
 @pytree
@@ -344,10 +351,12 @@ class Iterate:
         return cls(x, u, y, merit, jnp.int32(0), jnp.asarray(exact), jnp.asarray(True))
 
 
-def costates(s: Stages, u: Array, y: Array) -> Array:
-    """Return λ (N+1, n), the multipliers of x_0 … x_N: λ_k = ∂(J + y'rows)/∂x_k + A'λ_{k+1}."""
-    g = s.gradient(predict(s, u), u)[0] + s.pull(y)[0]
-    return jnp.concatenate([recurrence(s.A, g[:-1], g[-1], adjoint=True), g[-1:]])
+def costates(s: Stages, v: Array, y: Array) -> Array:
+    """Return λ (N+1, n), the multipliers of x_0 … x_N, for moves v (N, m) and y (rows,):
+    λ_k = ∂(J + y'rows)/∂x_k + A'λ_{k+1}, at fixed moves."""
+    x = predict(s, v)
+    g = s.at_fixed_moves(*jax.tree.map(jnp.add, s.gradient(x, s.inputs(x, v)), s.pull(y)))
+    return jnp.concatenate([recurrence(s.closed, g[:-1], g[-1], adjoint=True), g[-1:]])
 
 
 def defects(s: Stages, x: Array, u: Array) -> tuple[Array, Array, Array]:
@@ -359,20 +368,24 @@ def defects(s: Stages, x: Array, u: Array) -> tuple[Array, Array, Array]:
     return parts[0] + parts[1] + parts[2] - x[1:], sizes, terms
 
 
-def nonlinear_residuals(s: Stages, E: Array, u: Array, y: Array) -> Terms:
+def nonlinear_residuals(s: Stages, E: Array, v: Array, y: Array) -> Terms:
     """Return the residuals of the nonlinear problem at the point of expansion: those of the
-    expansion, with the defects among the rows."""
-    of_rows, *rest = stage_residuals(s, E, u, y)
-    of_defects = defects(s, s.aim.states, u)
+    expansion, with the defects among the rows; v (N, m): the moves there."""
+    of_rows, *rest = stage_residuals(s, E, v, y)
+    of_defects = defects(s, s.aim.states, s.aim.inputs)
     joined = [jnp.concatenate([a, b.ravel()]) for a, b in zip(of_rows, of_defects, strict=True)]
     return [(joined[0], joined[1], joined[2]), *rest]
 
 
 def nonlinear_conditions(
-    data: tuple[Stages, NonlinearMPC], constants: tuple[Array, Array], z: Array, y: Array
+    data: tuple[Stages, NonlinearMPC],
+    constants: tuple[Array, Array, Array | None],
+    z: Array,
+    y: Array,
 ) -> tuple[Callable[[Any], Any], Undo]:
     """The `conditions_of` that `implicit` takes for the solution z, its states and inputs: those of
-    the expansion about it, with the Hessian of the Lagrangian, and its states.
+    the expansion about it, with the Hessian of the Lagrangian, and its states. constants: E, ρ and
+    the gain of the moves.
 
     Of an expansion about a fixed point the gradients and states, which depend on the data, and this
     Hessian are the first derivatives of the optimality conditions of the nonlinear problem with
@@ -380,27 +393,29 @@ def nonlinear_conditions(
     derivatives of higher order are those of the nonlinear problem too.
     """
     x, u = _states_inputs(data[0], z)
-    about = lambda data: expanded(data[0], data[1], x, u)
-    s, (base, problem), (E, rho) = about(data), data, constants
-    lam = costates(s, u, s.bounds.admissible(y))
+    (base, problem), (E, rho, gain) = data, constants
+    about = lambda data: replace(expanded(data[0], data[1], x, u), gain=gain)
+    s = about(data)
+    v = s.moves(x, u)
+    lam = costates(s, v, s.bounds.admissible(y))
     exact = curved(s, base, problem, x, u, lam, y)
     # Elsewhere than at a strict minimum, as where the search has not ended, the exact one has no
     # solution: NaN would spoil the sums of a batch.
     convex = convex_with(*jax.lax.stop_gradient((exact, held(s, E, y))))
     bent = where_hessian(convex, exact, s)
-    conditions, undo = stage_conditions(with_hessian(s, bent), (E, rho), u, y)
+    conditions, undo = stage_conditions(with_hessian(s, bent), (E, rho), v, y)
 
     def conditions_at(data: Any) -> tuple[Array, Array]:
         s = about(data)
-        return conditions(with_hessian(s, bent)), predict(s, u)
+        return conditions(with_hessian(s, bent)), predict(s, v)
 
     def undo_all(moved: tuple[Array, Array]) -> tuple[Array, Array]:
-        du, dy = undo(moved[0])
-        follow = lambda du: recurrence(s.A, apply(s.B, du), jnp.zeros_like(x[0]))
+        dv, dy = undo(moved[0])
+        follow = lambda dv: recurrence(s.closed, apply(s.B, dv), jnp.zeros_like(x[0]))
         # Linear; as a derivative of itself it can be transposed, kernels or not.
-        dx = jax.jvp(follow, (jnp.zeros_like(du),), (du,))[1]
+        dx = jax.jvp(follow, (jnp.zeros_like(dv),), (dv,))[1]
         dx = moved[1] + jnp.pad(dx, ((1, 0), (0, 0)))
-        return jnp.concatenate([dx.ravel(), du.ravel()]), dy
+        return jnp.concatenate([dx.ravel(), s.inputs(dx, dv).ravel()]), dy
 
     return conditions_at, undo_all
 
@@ -436,29 +451,27 @@ def sqp_step(most: int, hessian: str, constants: tuple, state: Iterate) -> Itera
     """
     base, problem, scale, eps = constants
     x, u, y = state.x, state.u, state.y
-    s = expanded(base, problem, x, u)
-    y = s.bounds.admissible(y)
-    E, rho = scales(s, scale)
+    s, E, rho = scaled(expanded(base, problem, x, u), scale)
+    y, v = s.bounds.admissible(y), s.moves(x, u)
     residuals, floor = nonlinear_residuals, rounding(x.dtype)
-    measure = lambda s, E, u, y, eps: Measured.of(residuals(s, E, u, y), eps, floor)
-    solved = precisely(measure, s, E, u, y, eps / 10).within_tolerance
+    measure = lambda s, E, v, y, eps: Measured.of(residuals(s, E, v, y), eps, floor)
+    solved = precisely(measure, s, E, v, y, eps / 10).within_tolerance
     exact = jnp.asarray(False)
     if hessian == "exact":
-        bent = curved(s, base, problem, x, u, costates(s, u, y), y)
+        bent = curved(s, base, problem, x, u, costates(s, v, y), y)
         exact = state.exact & convex_with(bent, held(s, E, y))
         s = where_hessian(exact, bent, s)
     fixed = s.bounds.unmoved(E, s.rows(x, u))
-    u_qp, y_qp, usable = precisely(solved_qp, s, E, rho, fixed, eps, u, y, exact)
-    du, dy = u_qp - u, y_qp - y
+    v_qp, y_qp, usable = precisely(solved_qp, s, E, rho, fixed, eps, v, y, exact)
 
-    merit = state.merit.raised(costates(s, u_qp, y_qp)[1:], y_qp)
-    whole_steps = corrected(s, base, problem, E, rho, u_qp, y_qp)
+    merit = state.merit.raised(costates(s, v_qp, y_qp)[1:], y_qp)
+    whole_steps = corrected(s, base, problem, E, rho, v_qp, y_qp)
     search, predicted, slack = line_search(merit, s, base, problem, whole_steps)
-    go = ~solved & search.found & jnp.all(jnp.isfinite(du))
+    go = ~solved & search.found & jnp.all(jnp.isfinite(v_qp))
     go = go & (~exact | (usable & (predicted > -slack)))
     length = search.length
     step = lambda v, d: v + jnp.where(go, d, 0.0)
-    x, u, y = step(x, search.step[0]), step(u, search.step[1]), step(y, length * dy)
+    x, u, y = step(x, search.step[0]), step(u, search.step[1]), step(y, length * (y_qp - y))
     count = state.steps + ~solved
     exact_next, open_ = go & usable & (length == 1), ~solved & (go | exact) & (count < most)
     return Iterate(x, u, y, merit, count, exact_next, open_)
@@ -476,24 +489,26 @@ class LineSearch:
 
 
 def corrected(
-    s: Stages, base: Stages, problem: NonlinearMPC, E: Array, rho: Array, u: Array, y: Array
+    s: Stages, base: Stages, problem: NonlinearMPC, E: Array, rho: Array, v: Array, y: Array
 ) -> tuple[Array, Array]:
-    """Return whole steps in states (3, N+1, n) and inputs (3, N, m): to the solution u, y of the QP
-    s; the same inputs with states that close its defects to first order; and what a Newton step
+    """Return whole steps in states (3, N+1, n) and inputs (3, N, m): to the solution v, y of the QP
+    s; the same moves with states that close its defects to first order; and what a Newton step
     leads to on the QP whose dynamics and rows have the values of the model there.
 
     Near a solution the defects and violations of whole steps, second-order terms times large
     weights, exceed what the cost gains (Maratos 1978; second-order corrections: Nocedal, Wright
     2006, §18.3).
     """
-    x = predict(s, u)
+    x = predict(s, v)
+    u = s.inputs(x, v)
     gap = jax.vmap(problem.model.step)(x[:-1], u) - x[1:]
     bend = rows_of(s, base, problem, x, u) - s.rows(x, u)
     bounds = replace(s.bounds, l=s.bounds.l - bend, u=s.bounds.u - bend)
     there = replace(s, c=s.c + gap, bounds=bounds)
-    u_there, _ = precisely(stage_newton_step, there, E, rho, u, y)
-    states = jnp.stack([x, predict(there, u), predict(there, u_there)])
-    return states - s.aim.states, jnp.stack([u, u, u_there]) - s.aim.inputs
+    v_there, _ = precisely(stage_newton_step, there, E, rho, v, y)
+    moves = jnp.stack([v, v, v_there])
+    states = jnp.stack([x, predict(there, v), predict(there, v_there)])
+    return states - s.aim.states, jax.vmap(s.inputs)(states, moves) - s.aim.inputs
 
 
 def line_search(
@@ -534,11 +549,11 @@ def solved_qp(
     rho: Array,
     fixed: Array,
     eps: Array,
-    u: Array,
+    v: Array,
     y: Array,
     exact: Array,
 ) -> tuple[Array, Array, Array]:
-    """Return the solution of a QP from u (N, m), y (rows,), and whether it is one: Newton steps,
+    """Return the solution of a QP from v (N, m), y (rows,), and whether it is one: Newton steps,
     and after them, unless `exact`, interior point steps."""
 
     def loop(step: Callable, most: int, constants: tuple, state: Any) -> Any:
@@ -546,7 +561,7 @@ def solved_qp(
         return jax.lax.while_loop(is_open, step, varying(state, (state, constants)))
 
     search = Search(NEWTON_STEPS, INTERIOR_STEPS, loop)
-    best = search.from_pair(s, E, rho, fixed, eps, measured_pair(eps, s, E, u, y), ~exact)
+    best = search.from_pair(s, E, rho, fixed, eps, measured_pair(eps, s, E, v, y), ~exact)
     return best.z, best.y, best.measured.within_tolerance
 
 
