@@ -49,6 +49,17 @@ def require_printable(argument: str, *names: str) -> None:
             fail(argument, f"{ascii(name)} holds control characters", cure)
 
 
+def require_names(
+    argument: str, value: object, count: int, cure: str = 'Write it as ("q", "dq")'
+) -> None:
+    """Raise unless a value is a tuple of strings, `count` of them or none, that are printable."""
+    if not isinstance(value, tuple) or not all(isinstance(name, str) for name in value):
+        fail(argument, f"{value!r} is not a tuple of strings", cure)
+    if len(value) not in (0, count):
+        fail(argument, f"{len(value)} entries where {count} are needed", "Give all or none")
+    require_printable(argument, *value)
+
+
 def installing(extra: str) -> str:
     """Return how to install an extra: from the source, as this package is on no index."""
     return f"pip install -e '.[{extra}]' in the folder of jaxmpc's source"

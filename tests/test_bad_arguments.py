@@ -423,7 +423,7 @@ CALLS = [
         lambda: mpc(outputs=jm.Outputs(np.eye(2), [0, 0], [1, 1], stages=(9,))).validate(),
     ),
     (
-        "outputs[0].names: ['a', 'b']. Give a tuple of",
+        "outputs[0].names: ['a', 'b'] is not a tuple",
         lambda: mpc(outputs=jm.Outputs(np.eye(2), [0, 0], [1, 1], names=["a", "b"])).validate(),
     ),
     ("A: 'A' where real numbers are", lambda: jm.LinearSystem("A", B).validate()),
@@ -902,7 +902,7 @@ def test_errors_inside_a_constructor_stay_what_they_are():
     "message, call",
     [
         ("Polytope.h: shape (2,) where (1,) is", lambda: jm.Polytope([[1.0, 0.0]], [1.0, 2.0])),
-        ("Polytope.labels: 1 entries for 2 rows", lambda: jm.Polytope(np.eye(2), x, ("a",))),
+        ("Polytope.labels: 1 entries where 2", lambda: jm.Polytope(np.eye(2), x, ("a",))),
         ("Box.upper: shape (3,) where (2,) is", lambda: jm.Box([1, 2], [3, 4, 5])),
         ("Zonotope.generators: shape (1, 3) is not", lambda: jm.sets.Zonotope(x, [[1, 2, 3]])),
         ("Ellipsoid.P: shape (2, 3) is not (n, n)", lambda: jm.Ellipsoid(np.ones((2, 3)), 1.0)),

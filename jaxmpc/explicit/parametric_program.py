@@ -9,7 +9,7 @@ from jaxmpc.checks import (
     fail,
     require_finite,
     require_kind,
-    require_printable,
+    require_names,
     require_real,
     require_shape,
     require_symmetric_psd,
@@ -130,11 +130,7 @@ class ParametricQP:
             fail("h", "holds NaN or -inf", "Give numbers, inf for a row that does not bind")
         require_symmetric_psd("P", self.P)
         self._validate_output(nz, p)
-        if not isinstance(self.names, tuple) or not all(isinstance(v, str) for v in self.names):
-            fail("names", f"{self.names!r} is not a tuple of strings", "Name all, or none")
-        if len(self.names) not in (0, p):
-            fail("names", f"{len(self.names)} for {p} parameters", "Name all of them, or none")
-        require_printable("names", *self.names)
+        require_names("names", self.names, p)
 
     def _validate_output(self, nz: int, p: int) -> None:
         if self.output is None:

@@ -49,6 +49,7 @@ from jaxmpc.qp.problem import QP
 from jaxmpc.sets.convex_sets import Box, Zonotope
 from jaxmpc.sets.disturbances import with_vertices, worst
 from jaxmpc.sets.minimal_invariant import minimal_robust_invariant_set
+from jaxmpc.systems.riccati import require_stable
 from jaxmpc.systems.system import host_matrices
 
 # What stands for no bound of a variable.
@@ -181,9 +182,7 @@ def tube_section(mpc: MPC) -> Zonotope:
         fail("policy", "'tube' beside traced dynamics, gain or disturbances", cure)
     gain, plant = np.asarray(feedback_gain(mpc), float), replace(mpc.system, c=None)
     A, B, _ = host_matrices(plant)
-    if not (radius := np.abs(np.linalg.eigvals(A + B @ gain)).max()) < 1:
-        what = f"A + B gain has spectral radius {radius:.9g}"
-        fail("gain", what, "Give one that stabilises, or none for that of the LQR")
+    require_stable("gain", A + B @ gain)
     found = minimal_robust_invariant_set(
         plant, gain, mpc.disturbance, disturbance_matrix=mpc.disturbance_matrix
     )

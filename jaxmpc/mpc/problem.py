@@ -24,6 +24,7 @@ from jaxmpc.checks import (
     require_finite,
     require_kind,
     require_last,
+    require_names,
     require_real,
     require_shape,
     require_symmetric_psd,
@@ -540,11 +541,7 @@ class MPC:
         if concrete(rows.sides):  # −inf above or inf below: no row reaches that
             Box(*rows.sides).validate(name)
         for what in ("names", "units"):
-            given = getattr(rows, what)
-            if not isinstance(given, tuple) or not all(isinstance(text, str) for text in given):
-                fail(f"{name}.{what}", f"{given!r}", "Give a tuple of strings")
-            if len(given) not in (0, p):
-                fail(f"{name}.{what}", f"{len(given)} for {p} rows", "All or none")
+            require_names(f"{name}.{what}", getattr(rows, what), p)
 
     def _validate_rates(self) -> None:
         m, W, limit = self.system.m, self.input_rate_weight, self.input_rate_limit

@@ -13,7 +13,6 @@ from jaxmpc.checks import (
     entries,
     fail,
     require_finite,
-    require_printable,
     require_shape,
     whole,
 )
@@ -78,15 +77,6 @@ def require_dimension(argument: str, given: int, wanted: int | None) -> None:
     if wanted is not None and given != wanted:
         cure = "Bound every coordinate (inf for no bound)"
         fail(argument, f"has dimension {given} where {wanted} is needed", cure)
-
-
-def require_labels(argument: str, labels: object, rows: int) -> None:
-    """Raise unless `labels` is a tuple of strings, one a row or none."""
-    if not isinstance(labels, tuple) or not all(isinstance(label, str) for label in labels):
-        fail(argument, f"{labels!r} is not a tuple of strings", 'Write it as ("q <= 1", "q >= -1")')
-    if len(labels) not in (0, rows):
-        fail(argument, f"{len(labels)} entries for {rows} rows", "Label all rows or none")
-    require_printable(argument, *labels)
 
 
 def affine_map(

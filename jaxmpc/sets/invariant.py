@@ -21,7 +21,7 @@ from jaxmpc.qp.linalg import arrays, cholesky, eigh, floating_dtype, matmul, sol
 from jaxmpc.sets.convex_sets import Box, ConvexSet, Ellipsoid, Polytope, as_polytope
 from jaxmpc.sets.disturbances import disturbance_set, largest_norm, supports
 from jaxmpc.sets.lp import ROUNDING, Program, extent
-from jaxmpc.systems.riccati import LQR
+from jaxmpc.systems.riccati import LQR, require_stable
 from jaxmpc.systems.system import LinearSystem
 
 # A row counts as redundant if it is exceeded by no more than this, relative to its bound.
@@ -104,10 +104,7 @@ def maximal_invariant_set(
     closed, F = _closed_loop(system, K, states, inputs)
     n = system.n
     W = disturbance_set(disturbance, n, disturbance_matrix)
-    radius = np.abs(np.linalg.eigvals(closed)).max()
-    if not radius < 1:
-        cure = "Use a stabilizing K with u = Kx (python-control's K has the other sign)"
-        fail("K", f"A + BK has spectral radius {radius:.9g}, which is not below 1", cure)
+    radius = require_stable("K", closed)
     rows, newest, b = F, F, np.ones(len(F))
     reach = np.full(n, np.inf)
     for t in range(whole("max_iterations", max_iterations, 1) + 1):

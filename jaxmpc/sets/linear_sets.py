@@ -21,7 +21,16 @@ import numpy as np
 import scipy
 
 from jaxmpc.arrays import Reals, as_array, dimensions, host_array, store_floats
-from jaxmpc.checks import concrete, fail, number, require_finite, require_kind, require_real, whole
+from jaxmpc.checks import (
+    concrete,
+    fail,
+    number,
+    require_finite,
+    require_kind,
+    require_names,
+    require_real,
+    whole,
+)
 from jaxmpc.pytrees import pytree, record, static
 from jaxmpc.sets import generators, geometry, polyhedra
 from jaxmpc.sets.fields import (
@@ -36,7 +45,6 @@ from jaxmpc.sets.fields import (
     points,
     product,
     require_dimension,
-    require_labels,
     require_matching,
     section,
     vector,
@@ -581,7 +589,8 @@ class Polytope(LinearSet):
 
     def _require_fields(self, argument: str, dimension: int | None = None) -> None:
         require_matching(argument, {"H": self.H, "h": self.h}, 2, dimension)
-        require_labels(f"{argument}.labels", self.labels, np.shape(as_array(self.h))[0])
+        cure = 'Write it as ("q <= 1", "q >= -1")'
+        require_names(f"{argument}.labels", self.labels, np.shape(as_array(self.h))[0], cure)
 
 
 @pytree
@@ -684,20 +693,25 @@ class Box(LinearSet):
 
     def tightened(self, fraction: float | jax.Array) -> "Box":
         """Return the box with its two-sided coordinates narrowed on each side by a fraction of
-        their half-width. Works inside jit, vmap and grad with respect to `fraction`."""
-        lower, upper = np.asarray(self.lower, float), np.asarray(self.upper, float)
-        half = np.where(np.isfinite(upper - lower), upper - lower, 0.0) / 2
-        return Box(lower + fraction * half, upper - fraction * half)
+        their half-width. Traceable."""
+        _, (lower, upper) = numbers(self.lower, self.upper)
+        by = fraction * self._half_ranges()
+        return Box(lower + by, upper - by)
 
     def half_widths(self) -> AnyArray:
         """Return half the distance between the two ends of each coordinate, (n,); 1 where an end
         is infinite or both coincide. It is the unit of weights and tolerances. Traceable."""
-        self = self.spread(1)
+        half = self.spread(1)._half_ranges()
+        xp, _ = numbers(half)
+        return xp.where(half > 0, half, 1.0)
+
+    def _half_ranges(self) -> AnyArray:
+        """Return half the distance between the two ends, 0 where one is infinite."""
         xp, (lower, upper) = numbers(self.lower, self.upper)
         # Infinite ends have no derivative, not NaN.
         finite = xp.isfinite(lower) & xp.isfinite(upper)
         low, high = (xp.where(finite, end, 0.0) for end in (lower, upper))
-        return xp.where(high > low, (high - low) / 2, 1.0)
+        return (high - low) / 2
 
     def rows(self) -> tuple[AnyArray, AnyArray, AnyArray]:
         """Return (H, lower, upper) of the two-sided rows lower <= H x <= upper; H is the

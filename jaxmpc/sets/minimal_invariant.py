@@ -25,6 +25,7 @@ from jaxmpc.sets.disturbances import (
     with_vertices,
 )
 from jaxmpc.sets.fields import one_or_many
+from jaxmpc.systems.riccati import require_stable
 from jaxmpc.systems.system import LinearSystem, host_matrices
 
 # What rounding may add to α, and to a generator of F relative to its size.
@@ -146,10 +147,7 @@ def minimal_robust_invariant_set(
         fail("eps", f"{eps}", "Give a relative excess between 0 and 1, such as 1e-3")
     max_steps = whole("max_steps", max_steps, 1)
     closed = A + B @ host_array("K", K)
-    radius = float(np.abs(np.linalg.eigvals(closed)).max())
-    if not radius < 1:
-        cure = "Use a stabilizing K with u = Kx (python-control's K has the other sign)"
-        fail("K", f"A + BK has spectral radius {radius:.9g}, which is not below 1", cure)
+    radius = require_stable("K", closed)
 
     normals, spread = _normals(E, W), np.zeros(n)
     W = with_vertices(W)

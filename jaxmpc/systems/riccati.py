@@ -97,7 +97,7 @@ def lqr(system: LinearSystem, Q: Reals, R: Reals) -> LQR:
     try:
         P = _refine(A, B, q, r, scipy.linalg.solve_discrete_are(A, B, q, r))
         K = _gain(A, B, r, P)
-        radius = np.abs(np.linalg.eigvals(A + B @ K)).max()
+        radius = spectral_radius(A + B @ K)
     except (np.linalg.LinAlgError, ValueError):
         radius = np.inf
     if not radius < 1:  # too close to the threshold for the test above: name the likelier cause
@@ -106,6 +106,22 @@ def lqr(system: LinearSystem, Q: Reals, R: Reals) -> LQR:
             fail("B", f"hardly {unmoved}, {rest}", "Actuate that")
         fail("Q", f"hardly {unseen}, {rest}", "Give it some")
     return LQR(K=units.gain(K), P=units.cost_matrix(P))
+
+
+def spectral_radius(M: np.ndarray) -> float:
+    """Return the largest modulus of an eigenvalue of M (n, n), or of matrices (..., n, n)."""
+    return float(np.abs(np.linalg.eigvals(M)).max())
+
+
+def require_stable(argument: str, closed: np.ndarray) -> float:
+    """Return the spectral radius of A + BK (n, n); ValueError, which names the gain K, where it is
+    not below 1."""
+    radius = spectral_radius(closed)
+    if not radius < 1:
+        cure = "Use a stabilizing K with u = Kx (python-control's K has the other sign)"
+        what = f"A + BK has spectral radius {radius:.9g}, which is not below 1"
+        fail(argument, what, cure)
+    return radius
 
 
 def cost_of_law(system: LinearSystem, K: Reals, Q: Reals, R: Reals) -> Array | np.ndarray:
@@ -127,9 +143,7 @@ def cost_of_law(system: LinearSystem, K: Reals, Q: Reals, R: Reals) -> Array | n
         closed = a + b @ k
         units = natural_units(a, b, q, r)
         closed, _ = units.system(closed, b)
-        radius = np.abs(np.linalg.eigvals(closed)).max()
-        if not radius < 1:
-            fail("K", f"A + BK has spectral radius {radius:.9g}", "Use a stabilizing K with u = Kx")
+        require_stable("K", closed)
         cost, _ = units.weights(q + k.T @ r @ k, r)
         P = scipy.linalg.solve_discrete_lyapunov(closed.T, cost)
         return units.cost_matrix((P + P.T) / 2)

@@ -16,6 +16,7 @@ from jaxmpc.checks import (
     nearest,
     require_finite,
     require_last,
+    require_names,
     require_printable,
     require_shape,
 )
@@ -88,7 +89,7 @@ class LinearSystem:
             require_last("c", self.c, (n,), "Give one number a state, or None")
         for kind, count in (("state", n), ("input", self.m)):
             for what in (f"{kind}_names", f"{kind}_units"):
-                _require_strings(what, getattr(self, what), count)
+                require_names(what, getattr(self, what), count)
             names = getattr(self, f"{kind}_names")
             if len(set(names)) < len(names):
                 fail(f"{kind}_names", f"{names} has a name twice", "Give each a name of its own")
@@ -282,11 +283,3 @@ def _labels(
     names = names or tuple(f"{letter}{i + 1}" for i in range(count))
     pairs = zip(names, units or ("",) * len(names), strict=True)
     return tuple(f"{name} [{unit}]" if unit else name for name, unit in pairs)
-
-
-def _require_strings(argument: str, value: Any, count: int) -> None:
-    if not isinstance(value, tuple) or not all(isinstance(name, str) for name in value):
-        fail(argument, f"{value!r} is not a tuple of strings", 'Write it as ("q", "dq")')
-    if len(value) not in (0, count):
-        fail(argument, f"{len(value)} entries where {count} are needed", "Give all or none")
-    require_printable(argument, *value)

@@ -533,7 +533,7 @@ def test_soft_rows_rates_and_blocks(plan, policy, fields):
          "disturbance: is a Polytope, which has no generators, as this policy needs them"),
         ({"policy": "tube", "disturbance": jm.Box([-1.0, -1.0], [1.0, 1.0])},
          "disturbance: takes more than there is of input"),
-        ({"policy": "tube", "gain": [[0.0, 0.0]]}, "gain: A . B gain has spectral radius"),
+        ({"policy": "tube", "gain": [[0.0, 0.0]]}, "gain: A . BK has spectral radius"),
         ({"horizon": 2000}, "horizon: needs"),
     ],
 )  # fmt: skip

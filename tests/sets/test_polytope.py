@@ -448,7 +448,7 @@ def test_labels_follow_their_rows():
     assert Polytope([[0, 0], [1, 0], [0, 1], [-1, -1]], [1, 1, 1, 1], tuple("abcd")).reduce(
     ).labels == ("b", "c", "d")  # fmt: skip
     assert jax.tree.map(lambda leaf: 2 * leaf, TRIANGLE).labels == TRIANGLE.labels
-    for labels, message in [(("a",), "labels: 1 entries for 3"), (["a"] * 3, "labels: .* tuple")]:
+    for labels, message in [(("a",), "labels: 1 entries where 3"), (["a"] * 3, "labels: .* tuple")]:
         with pytest.raises(ValueError, match=message):
             Polytope(TRIANGLE.H, TRIANGLE.h, labels).validate("states")
 
