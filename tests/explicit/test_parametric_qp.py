@@ -282,7 +282,7 @@ def test_errors():
         ({"S": np.ones(2)}, "S: shape"),
         ({"F": [[1.0, 2], [3, 4]]}, "S: shape"),
         ({"q": [np.inf, 0]}, "q: holds NaN or infinity"),
-        ({"names": ("a", "b")}, "names: 2 for 1"),
+        ({"names": ("a", "b")}, "names: 2 entries where 1"),
         ({"output": (np.eye(2), np.eye(2), np.zeros(2))}, "output: direct"),
         ({"h": [-3.0, 1.0], "G": np.zeros((2, 2))}, "is empty"),
     ]:
