@@ -21,7 +21,7 @@ from jaxmpc.checks import (
 )
 from jaxmpc.mpc.stagewise.nonlinear import NonlinearMPC, linear_model
 from jaxmpc.pytrees import named_pytree, pytree, static
-from jaxmpc.qp.linalg import arrays, eigh, matmul, solve, symmetric
+from jaxmpc.qp.linalg import arrays, matmul, solve, symmetric, symmetric_root
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.robot import Robot, RobotModel
 from jaxmpc.systems.riccati import least_reached, lqr
@@ -123,8 +123,7 @@ def _drawn(key: Array, spread: Any, shape: tuple[int, int], dtype: Any) -> Array
     draws, spread = jax.random.normal(key, shape, dtype), jnp.asarray(spread, dtype)
     if spread.ndim < 2:
         return draws * spread
-    variances, axes = eigh(symmetric(spread))  # no Cholesky factor: covariances may be singular
-    return matmul(draws * jnp.sqrt(jnp.maximum(variances, 0)), axes.T)
+    return matmul(draws, symmetric_root(symmetric(spread)))
 
 
 # What a disturbance is added to.
@@ -208,9 +207,9 @@ class KalmanFilter:
         if not isinstance(self.model, Robot):
             self.model.validate()
         n = self.model.n
-        if self.C is None and n % 2:
+        if self.C is None and n % 2 and not isinstance(self.model, Robot):
             fail("observer.C", f"is None with {n} states", "Say which outputs are measured")
-        p = n // 2 if self.C is None else np.shape(self.C)[0] if np.ndim(self.C) == 2 else 1
+        p = self.p if self.C is None or np.ndim(self.C) == 2 else 1
         if self.C is not None:
             require_shape("observer.C", self.C, (p, n), "One row an output")
             require_finite("observer.C", self.C)
@@ -351,7 +350,10 @@ class KalmanFilter:
     @property
     def p(self) -> int:
         """Return the number of outputs."""
-        return self.model.n // 2 if self.C is None else np.shape(self.C)[0]
+        if self.C is not None:
+            return np.shape(self.C)[0]
+        # Positions; a robot's activations come after its velocities.
+        return self.model.mujoco.nv if isinstance(self.model, Robot) else self.model.n // 2
 
     def outputs(self, xi: Array) -> Array:
         """Return C ξ (p,)."""

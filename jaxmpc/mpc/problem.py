@@ -31,8 +31,8 @@ from jaxmpc.checks import (
 )
 from jaxmpc.pytrees import named_pytree, prepared_pytree, pytree, static, static_pytree
 from jaxmpc.qp.linalg import apply, matmul, namespace, symmetric
-from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope
-from jaxmpc.sets.disturbances import require_disturbance
+from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope, Zonotope
+from jaxmpc.sets.disturbances import is_centred, require_disturbance
 from jaxmpc.sets.fields import require_dimension
 from jaxmpc.sets.limits import output_limits
 from jaxmpc.systems.system import LinearSystem, host_matrices
@@ -583,6 +583,11 @@ class MPC:
             require_shape("disturbance_matrix", self.disturbance_matrix, (n, p), "One row a state")
             require_finite("disturbance_matrix", self.disturbance_matrix)
         require_disturbance("disturbance", W, self.disturbances)
+        off_centre = isinstance(W, Box | Zonotope) and concrete(W) and not is_centred(W)
+        if self.policy == "affine" and self.control_horizon is not None and off_centre:
+            cure = "Move its centre w into system.c, by disturbance_matrix times w, and W by -w"
+            what = "is not symmetric about 0, where a control horizon holds affine policies"
+            fail("disturbance", what, cure)
         if self.gain is not None and self.policy == "affine":
             fail("gain", "given with affine policies, which find their own", "Leave it out")
         if self.gain is not None:
@@ -805,7 +810,7 @@ def _with_limits(rows: Outputs) -> Outputs | None:
         return rows if rows.stages else None
     lower, upper = rows.sides
     bounded = np.isfinite(lower) | np.isfinite(upper)
-    bounded = bounded.reshape(-1, bounded.shape[-1]).any(axis=0)
+    bounded = bounded.any(axis=tuple(range(bounded.ndim - 1)))
     keep = lambda v: np.asarray(v)[..., bounded]
     of_rows = lambda M: np.asarray(M)[..., bounded, :]
     text = lambda v: tuple(str(part) for part in keep(v)) if v else ()

@@ -309,8 +309,9 @@ def stacked(
     parts = [added(x, v, block.H, block.D) for x, v in zip(states, inputs, strict=True)]
     given = fixed((states[0], inputs[0], block.H, block.D))
     terms = added(*jax.tree.map(xp.abs, given))
-    most = xp.max(terms.reshape(len(steps), r, -1, m), axis=(0, 2), initial=0.0)
-    noise = 8 * xp.finfo(terms.dtype).eps * xp.tile(most, terms.shape[-1] // m)
+    moves = terms.shape[-1] // m
+    most = xp.max(terms.reshape(len(steps), r, moves, m), axis=(0, 2), initial=0.0)
+    noise = 8 * xp.finfo(terms.dtype).eps * xp.tile(most, moves)
     none = fixed(xp.where(xp.abs(parts[0]) <= noise, parts[0], 0.0))
     C, D, d = (v.reshape(-1, *v.shape[2:]) for v in (parts[0] - none, *parts[1:]))
     return C, D, d

@@ -490,6 +490,26 @@ def _(primals: tuple, tangents: tuple) -> tuple[tuple, tuple]:
     return (w, V), (jnp.diag(moved), matmul(V, turned))
 
 
+@jax.custom_jvp
+def symmetric_root(K: Array) -> Array:
+    """Return S = S' ⪰ 0 with S S = K (n, n) ⪰ 0. A continuous function of K, also where K is
+    singular or its eigenvalues meet, unlike Cholesky factors and eigenvectors."""
+    w, V = eigh(K)
+    return matmul(V * jnp.sqrt(jnp.maximum(w, 0)), V.T)
+
+
+@symmetric_root.defjvp
+@own_modes
+def _(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    # dS S + S dS = dK, in the eigenvectors of K; infinite within its null space, 0 here.
+    w, V = eigh(*primals)
+    roots = jnp.sqrt(jnp.maximum(w, 0))
+    sums = roots[None, :] + roots[:, None]
+    moved = matmul(V.T, matmul(tangents[0], V))
+    moved = jnp.where(sums > 0, moved / jnp.where(sums > 0, sums, 1.0), 0.0)
+    return matmul(V * roots, V.T), matmul(V, matmul(moved, V.T))
+
+
 def _cholesky_in_place(K: Array, **_: Any) -> Array:
     return cholesky(K)
 

@@ -33,6 +33,8 @@ EULER, RK4 = 0, 1
 # mjtDisableBit, mjtEq, the last mjtTrn of a joint.
 NO_GRAVITY, NO_EULER_DAMPING = 128, 32768
 EQUALITY_OF_JOINTS, TRANSMISSION_BY_JOINT = 2, 1
+# mjtJacobian.
+DENSE = 0
 
 
 class Physics:
@@ -46,7 +48,9 @@ class Physics:
     """
 
     def __init__(self, model: "mujoco.MjModel") -> None:
-        self.model = model
+        # Sparse matrices hold what the file's numbers fill, and `numbers` may fill more.
+        self.model = model = copy.copy(model)
+        model.opt.jacobian = DENSE
         self.joints = tuple(int(joint) for joint in model.jnt_type)
         self.tree = Tree.of(model)
         try:
@@ -191,8 +195,6 @@ class Physics:
         """Return the accelerations by MJX's constraint solver."""
         mjx = mjx_module()
         data = data.replace(qfrc_smooth=force, qacc_smooth=solve(M, force))
-        if mjx.is_sparse(model):
-            M = M[np.repeat(np.arange(model.nv), model.M_rownnz), model.M_colind]
         data = mjx.factor_m(model, data.tree_replace({"_impl.M": M}))
         return mjx.solve(model, data).qacc
 

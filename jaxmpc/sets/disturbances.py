@@ -19,7 +19,6 @@ from jaxmpc.sets.convex_sets import (
     AnyNumber,
     Box,
     ConvexSet,
-    Ellipsoid,
     Polytope,
     Zonotope,
     as_polytope,
@@ -99,10 +98,19 @@ class Image(ConvexSet):
             fail("disturbance_matrix", f"shape {shape}", f"Give ({dimension or 'n'}, p)")
 
 
+def is_centred(W: Box | Zonotope) -> bool:
+    """Return whether a set of disturbances is known to be symmetric about zero."""
+    if not concrete(W):
+        return False
+    if isinstance(W, Box):
+        return bool(np.all(np.asarray(W.lower) == -np.asarray(W.upper)))
+    return not np.any(np.asarray(W.center))
+
+
 def require_disturbance(argument: str, W: Any, dimension: int) -> None:
     """Raise ValueError, naming `argument`, unless W is a bounded set in R^dimension that holds the
     origin. Of a set that is traced by JAX the kind and the shapes are checked."""
-    if isinstance(W, Ellipsoid) or not isinstance(W, ConvexSet):
+    if not isinstance(W, Box | Polytope | Zonotope | Vertices | Image):
         what = f"is a {type(W).__name__}"
         fail(argument, what, "Give a Box, a Polytope or a Zonotope of w, or None")
     W.validate(argument, dimension)
@@ -113,7 +121,7 @@ def require_disturbance(argument: str, W: Any, dimension: int) -> None:
         return
     if isinstance(W, Box | Polytope):
         G, g = as_polytope(argument, W, dimension).unit_rows(argument)
-        bounded, held = np.isfinite(extent(G, g)).all(), g.min() >= 0
+        bounded, held = np.isfinite(extent(G, g)).all(), np.all(g >= 0)
     else:
         identity = np.eye(dimension)
         ends = np.array([W.support(d) for d in np.concatenate([identity, -identity])])

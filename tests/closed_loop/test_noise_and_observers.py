@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 import scipy
@@ -9,6 +10,7 @@ from c_engine import c_steps
 
 import jaxmpc as jm
 from jaxmpc.closed_loop import KalmanFilter, LinearFeedback, Noise
+from jaxmpc.closed_loop.estimation import _drawn
 
 T, J = 0.1, 0.5
 SYSTEM = jm.LinearSystem(
@@ -30,6 +32,39 @@ STEPS, LOOPS = 60, 4000
 def _float64():
     with jax.enable_x64(True):
         yield
+
+
+def test_noise_is_continuous_in_its_covariance():
+    """Where eigenvalues meet, and where some are zero, its draws do not jump; the derivative in a
+    covariance of equal standard deviations is that in these."""
+    drawn = lambda W: _drawn(jax.random.key(0), jnp.asarray(W), (5, 2), float)
+    at = drawn(np.diag([1e-2, 2e-2]))
+    for small in (1e-9, -1e-9):
+        np.testing.assert_allclose(drawn([[1e-2, small], [small, 2e-2]]), at, atol=1e-6)
+    np.testing.assert_allclose(drawn(1e-2 * np.eye(2)), drawn([0.1, 0.1]), atol=1e-12)
+    # dw = d(s²) w / (2 s²)
+    slope = jax.jacrev(lambda s: drawn(s * jnp.eye(2)))(1e-2)
+    np.testing.assert_allclose(slope, drawn([0.1, 0.1]) / 2e-2, rtol=1e-9)
+    direction, step = np.array([[1.0, 0.3], [0.3, 0.5]]), 1e-7
+    for covariance in (1e-2 * np.eye(2), np.diag([1e-2, 2e-2]), W):
+        slope = jax.jvp(drawn, (jnp.asarray(covariance),), (jnp.asarray(direction),))[1]
+        ends = (drawn(covariance + sign * step * direction) for sign in (1, -1))
+        above, below = ends
+        np.testing.assert_allclose(slope, (above - below) / (2 * step), rtol=1e-6, atol=1e-6)
+    flat = jax.jacrev(lambda s: drawn(jnp.diag(jnp.array([s, 0.0]))))(1e-2)
+    assert np.isfinite(flat).all()
+
+
+ACTIVATED = """<mujoco><worldbody><body><joint name="j" axis="0 1 0"/>
+<geom type="capsule" fromto="0 0 0 .4 0 0" size=".02" mass="1"/></body></worldbody>
+<actuator><general joint="j" dyntype="filter" dynprm=".05"/></actuator></mujoco>"""
+
+
+def test_outputs_of_a_robot_are_its_positions():
+    """Also where activations follow its velocities."""
+    robot = jm.load_robot(mujoco.MjModel.from_xml_string(ACTIVATED))
+    observer = KalmanFilter(robot, 1e-4, 1e-3, initial=0.05).prepared()
+    np.testing.assert_array_equal(observer.outputs(np.arange(1.0, 4.0)), [1.0])
 
 
 @pytest.fixture(scope="module")

@@ -142,3 +142,17 @@ def test_plans_that_dose_nothing(solve, n, m, unit, most):
         plans = solve(mpc, unit * x0s)
         assert (plans.status == Status.SOLVED).all()
         assert np.abs(plans.inputs).max() < 1e-9 * unit
+
+
+@pytest.mark.parametrize("name", ["states", "inputs", "terminal_set"])
+def test_a_polytope_without_rows_limits_nothing(name):
+    size = {"inputs": 1}.get(name, 2)
+    everything = jm.Box([-np.inf] * size, [np.inf] * size).to_polytope()
+    assert len(everything.h) == 0
+    system = jm.LinearSystem([[1, 1], [0, 1]], [0.5, 1.0])
+    limits = {"states": jm.Box([-5.0, -2.0], [5.0, 2.0]), "inputs": jm.Box(-1, 1)}
+    mpc = jm.MPC(system, np.eye(2), [[0.1]], 2, **{**limits, name: everything})
+    plain = jm.MPC(system, np.eye(2), [[0.1]], 2, **{**limits, name: None})
+    cost = [jm.solve(problem, [1.0, 0.0]).cost for problem in (mpc, plain)]
+    np.testing.assert_allclose(*cost, rtol=1e-6)
+    assert jm.soften(mpc, 1e3).horizon == 2

@@ -535,11 +535,28 @@ def test_soft_rows_rates_and_blocks(plan, policy, fields):
          "disturbance: takes more than there is of input"),
         ({"policy": "tube", "gain": [[0.0, 0.0]]}, "gain: A . BK has spectral radius"),
         ({"horizon": 2000}, "horizon: needs"),
+        ({"disturbance": jm.Box([0.0, 0.0], [0.1, 0.1]), "control_horizon": 2},
+         "disturbance: is not symmetric about 0, .* Move its centre w into system.c"),
     ],
 )  # fmt: skip
 def test_errors(fields, message):
     with pytest.raises(ValueError, match=message):
         jm.solve(robust(**{"policy": "affine", **fields}), [0.0, 0.0])
+
+
+def test_a_control_horizon_holds_the_plan_of_the_centre():
+    """W = [0, 2] as its centre in c and [−1, 1]. The feasible set ends at 1.2722 where the plan is
+    held at the centre, by a linear program over all vertices of W × W, and at 1.1780 where it is
+    held at w = 0."""
+    limits = jm.Box([-1.81], [1.42])
+    mpc = jm.MPC(
+        jm.LinearSystem([[-1.03]], [[-1.24]], [0.1]), [[1.0]], [[0.1]], 2, states=limits,
+        inputs=jm.Box([-0.8], [0.8]), terminal_set=limits, disturbance=jm.Box([-1.0], [1.0]),
+        disturbance_matrix=[[0.1]], policy="affine", control_horizon=1,
+    )  # fmt: skip
+    for x, label in ((1.272, 1), (1.2725, -1)):
+        assert jm.map_feasible_set(mpc, [[x]]).label[0] == label
+        assert (jm.solve(mpc, [x]).status == jm.Status.SOLVED) == (label == 1)
 
 
 @pytest.mark.long

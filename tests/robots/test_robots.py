@@ -407,6 +407,30 @@ def test_payload_on_an_arm_in_space():
         np.testing.assert_allclose(found[i], after, rtol=0, atol=1e-9)
 
 
+SPHERE = """<mujoco><option jacobian="sparse"/><worldbody><geom type="plane" size="3 3 .1"/>
+<body pos="0 0 .099"><freejoint/>{}<geom type="sphere" size=".1" mass="1"/></body>
+<body pos="1 0 1"><joint name="1" axis="0 1 0"/>
+<geom type="capsule" fromto="0 0 0 .4 0 0" size=".02"/></body>
+</worldbody><actuator><motor joint="1"/></actuator></mujoco>"""
+
+
+@pytest.mark.long
+def test_numbers_may_fill_what_is_zero_in_a_sparse_file():
+    """A sphere in contact whose centre of mass is moved: its inertia is no longer diagonal."""
+    mass = '<inertial pos=".03 0 .03" mass="1" diaginertia=".004 .004 .004"/>'
+    plain, moved = (mujoco.MjModel.from_xml_string(SPHERE.format(part)) for part in ("", mass))
+    for name in ("body_invweight0", "dof_invweight0"):  # `vary` keeps those of the file
+        getattr(moved, name)[:] = getattr(plain, name)
+    robot = jm.load_robot(plain)
+    x = np.concatenate([robot.home[:8], [1, 0, -0.1, 0, 0.5, 0.3, 0.2]])
+    places = np.array(plain.body_ipos)
+    places[1] = 0.03, 0, 0.03
+    with jax.enable_x64(True):
+        found = robot.vary(body_ipos=places).step(x, np.zeros(1))
+    after = c_steps(moved, x, np.zeros(1), robot.substeps)
+    np.testing.assert_allclose(found, after, rtol=0, atol=1e-12)
+
+
 # --- derivatives -----------------------------------------------------------------------------
 
 

@@ -10,6 +10,21 @@ from jaxmpc.sets import minimal_robust_invariant_set
 from jaxmpc.sets.disturbances import supports, with_vertices
 from jaxmpc.sets.minimal_invariant import sum_of_disturbances
 
+
+def test_what_is_no_set_of_disturbances_is_named():
+    system = jm.LinearSystem([[1, 1], [0, 1]], [0.5, 1.0])
+    K = jm.lqr(system, np.eye(2), [[0.1]]).K
+    small = minimal_robust_invariant_set(system, K, jm.Box([-0.1, -0.1], [0.1, 0.1]))
+    for W, message in (
+        (jm.Box([-np.inf] * 2, [np.inf] * 2), "disturbance: is unbounded. Bound every"),
+        (small, "disturbance: is a MinimalInvariantSet. Give a Box, a Polytope or a Zonotope"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            minimal_robust_invariant_set(system, K, W)
+        with pytest.raises(ValueError, match=message):
+            jm.MPC(system, np.eye(2), [[0.1]], 2, disturbance=W).validate()
+
+
 RAKOVIC = jm.LinearSystem([[-0.17, -0.03], [-1.17, -0.03]], np.zeros((2, 1)))
 DOUBLE = jm.LinearSystem([[1.0, 1.0], [0.0, 1.0]], [0.5, 1.0])
 THREE = jm.LinearSystem([[1, 0.2, -1], [0, 1, -0.2], [0, 0, 0.6]], [0, 0, 0.6])

@@ -102,15 +102,6 @@ def answers_disturbances(mpc: MPC) -> bool:
     return mpc.disturbance is not None and mpc.policy == "affine"
 
 
-def is_centred(W: Box | Zonotope) -> bool:
-    """Return whether a set of disturbances is known to be symmetric about zero."""
-    if not concrete(W):
-        return False
-    if isinstance(W, Box):
-        return bool(np.all(np.asarray(W.lower) == -np.asarray(W.upper)))
-    return not np.any(np.asarray(W.center))
-
-
 def require_independent_generators(W: Any) -> None:
     """Raise ValueError unless a policy can answer to each generator by itself."""
     require_generators(W)

@@ -34,7 +34,6 @@ from jaxmpc.mpc.stagewise.affine_policies import (
     affine_plan,
     answers_disturbances,
     bytes_needed,
-    is_centred,
     require_independent_generators,
 )
 from jaxmpc.mpc.stagewise.newton_steps import (
@@ -74,6 +73,7 @@ from jaxmpc.qp.residuals import Measured, Pair, Proof, assess, with_status
 from jaxmpc.qp.solve import tolerance
 from jaxmpc.qp.status import Status
 from jaxmpc.sets.convex_sets import Ellipsoid
+from jaxmpc.sets.disturbances import is_centred
 
 # Most stages that the passes of an ADMM step write out, without a loop over them. Loops reorder
 # (batch, N, …) to (N, batch, …) at each step, which takes longer than the products.
