@@ -265,3 +265,14 @@ def least_distance(mpc, x):
         r = E @ y - np.eye(len(E))[-1]
         shift = shift - right.min() * r[:-1] / r[-1]
     return -np.linalg.solve(factor.T, shift).reshape(N, m)
+
+
+def unstable_systems(count):
+    """A (3 count, 2, 2), B and states of random systems, `count` for each of three factors 1.3,
+    1.8 and 2.5 by which they grow at a step, in coordinates that may nearly coincide."""
+    rng, n = np.random.default_rng(3), 2
+    growth = np.repeat([1.3, 1.8, 2.5], count)
+    T = np.eye(n) + rng.uniform(-0.9, 0.9, (len(growth), n, n))
+    values = np.stack([growth, rng.uniform(-1, 1, len(growth)) * growth], axis=1)
+    A = T @ (values[:, :, None] * np.linalg.inv(T))
+    return A, rng.normal(size=(len(growth), n, 1)), rng.normal(size=(len(growth), n))

@@ -176,7 +176,8 @@ class KalmanFilter:
         the estimate moves the covariance (extended Kalman filter).
     process: of w, measurement: of v; standard deviations, a number or one an entry, or covariances,
         as in `Noise`. That of v must be positive definite.
-    C (p, n): outputs; None: the positions, the first half of the coordinates.
+    C (p, n): outputs; None: the positions, the first half of the coordinates (of a
+        robot with activations, which come last, the first nv).
     initial: of the error of the first estimate, as `process`. None, for linear models: the gain is
         constant, that of the steady state,
             L = P C'(C P C' + V)⁻¹,   P = A P A' + W − A P C'(C P C' + V)⁻¹ C P A'.

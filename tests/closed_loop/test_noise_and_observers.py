@@ -48,8 +48,7 @@ def test_noise_is_continuous_in_its_covariance():
     direction, step = np.array([[1.0, 0.3], [0.3, 0.5]]), 1e-7
     for covariance in (1e-2 * np.eye(2), np.diag([1e-2, 2e-2]), W):
         slope = jax.jvp(drawn, (jnp.asarray(covariance),), (jnp.asarray(direction),))[1]
-        ends = (drawn(covariance + sign * step * direction) for sign in (1, -1))
-        above, below = ends
+        above, below = (drawn(covariance + sign * step * direction) for sign in (1, -1))
         np.testing.assert_allclose(slope, (above - below) / (2 * step), rtol=1e-6, atol=1e-6)
     flat = jax.jacrev(lambda s: drawn(jnp.diag(jnp.array([s, 0.0]))))(1e-2)
     assert np.isfinite(flat).all()

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from jax import enable_x64
 from jax.sharding import AxisType, PartitionSpec
-from problems import lecture, residuals, rows_of, symmetric
+from problems import lecture, residuals, rows_of, symmetric, unstable_systems
 
 import jaxmpc as jm
 from jaxmpc.mpc.plan import Aim, WarmStart
@@ -407,12 +407,8 @@ def test_what_is_solved_costs_what_the_plan_costs_however_unstable_the_model():
 def test_unstable_systems_are_solved_where_the_condensed_program_is():
     """Systems that grow 3e3- to 1e12-fold over the horizon in open loop, also in coordinates that
     nearly coincide, where the plan is a difference of large terms."""
-    rng, n, N = np.random.default_rng(3), 2, 30
-    growth = np.repeat([1.3, 1.8, 2.5], 16)
-    T = np.eye(n) + rng.uniform(-0.9, 0.9, (len(growth), n, n))
-    values = np.stack([growth, rng.uniform(-1, 1, len(growth)) * growth], axis=1)
-    A = T @ (values[:, :, None] * np.linalg.inv(T))
-    B, x0 = rng.normal(size=(len(growth), n, 1)), rng.normal(size=(len(growth), n))
+    n, N = 2, 30
+    A, B, x0 = unstable_systems(16)
     one = jm.MPC(
         jm.LinearSystem(A[0], B[0]), np.eye(n), np.eye(1), N, states=symmetric(5.0, 5.0),
         inputs=symmetric(1.0), constrain_initial=False, prestabilise=True,

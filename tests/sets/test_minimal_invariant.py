@@ -10,6 +10,11 @@ from jaxmpc.sets import minimal_robust_invariant_set
 from jaxmpc.sets.disturbances import supports, with_vertices
 from jaxmpc.sets.minimal_invariant import sum_of_disturbances
 
+RAKOVIC = jm.LinearSystem([[-0.17, -0.03], [-1.17, -0.03]], np.zeros((2, 1)))
+DOUBLE = jm.LinearSystem([[1.0, 1.0], [0.0, 1.0]], [0.5, 1.0])
+THREE = jm.LinearSystem([[1, 0.2, -1], [0, 1, -0.2], [0, 0, 0.6]], [0, 0, 0.6])
+OFF = np.zeros((1, 2))
+
 
 def test_what_is_no_set_of_disturbances_is_named():
     system = jm.LinearSystem([[1, 1], [0, 1]], [0.5, 1.0])
@@ -23,12 +28,6 @@ def test_what_is_no_set_of_disturbances_is_named():
             minimal_robust_invariant_set(system, K, W)
         with pytest.raises(ValueError, match=message):
             jm.MPC(system, np.eye(2), [[0.1]], 2, disturbance=W).validate()
-
-
-RAKOVIC = jm.LinearSystem([[-0.17, -0.03], [-1.17, -0.03]], np.zeros((2, 1)))
-DOUBLE = jm.LinearSystem([[1.0, 1.0], [0.0, 1.0]], [0.5, 1.0])
-THREE = jm.LinearSystem([[1, 0.2, -1], [0, 1, -0.2], [0, 0, 0.6]], [0, 0, 0.6])
-OFF = np.zeros((1, 2))
 
 
 def test_numbers_of_rakovic_2005():

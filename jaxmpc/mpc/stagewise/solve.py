@@ -197,11 +197,7 @@ class StageFactor:
 @own_modes
 def _factor(mpc: MPC, rho: Any, scale: Any, steps: bool) -> StageFactor:
     s, fault = cleaned(Stages.of(mpc))
-    if scale is None:
-        free = riccati(s)
-        E, s = row_scale(s, free), replace(s, gain=stabilising_gain(s, free))
-    else:
-        E = jnp.asarray(scale, s.Q.dtype)
+    s, E = scaled(s, scale)
     inputs = s.horizon * s.B.shape[-1]
     rho = default_rho(E, inputs) if rho is None else jnp.asarray(rho, E.dtype)
     rho = jnp.broadcast_to(rho, (rho.shape[0] if rho.ndim == 2 else 1, E.shape[0]))
@@ -211,6 +207,15 @@ def _factor(mpc: MPC, rho: Any, scale: Any, steps: bool) -> StageFactor:
     E, gains, gain = jax.tree.map(lambda v: jnp.where(sound, v, 0.0), (E, gains, s.gain))
     fault = jnp.where(sound, fault, jnp.int32(Status.ITERATION_LIMIT))
     return StageFactor(replace(s, gain=gain), E, rho, gains, fault)
+
+
+def scaled(s: Stages, scale: Array | None) -> tuple[Stages, Array]:
+    """Return the stages with the gain of their moves, and the row scale E (rows,); without a gain
+    and with this row scale where one is given."""
+    if scale is not None:
+        return s, jnp.asarray(scale, s.Q.dtype)
+    free = riccati(s)
+    return replace(s, gain=stabilising_gain(s, free)), row_scale(s, free)
 
 
 def stabilising_gain(s: Stages, gains: Gains) -> Array:
@@ -344,8 +349,8 @@ def _plan(
     if answers_disturbances(mpc):
         return affine_plan(mpc, replace(s, gain=None), factor.E, fault, solver, aim, centred)
     if warm_start is not None:
-        x, u, y = warm_start
-        warm_start = WarmStart(s.joined(x, u), u, y)
+        states = s.joined(warm_start.states, warm_start.inputs)
+        warm_start = warm_start._replace(states=states)
     found = stage_solution(factor, s, solver, warm_start)
     found = replace(found, iterations=jnp.int32(solver.admm_steps(ADMM_STEPS)))
     x = predict(s, found.z)

@@ -52,8 +52,7 @@ from jaxmpc.mpc.stagewise.solve import (
     StageFactor,
     checked,
     full_aim,
-    row_scale,
-    stabilising_gain,
+    scaled,
     stage_solution,
 )
 from jaxmpc.mpc.stagewise.stages import (
@@ -210,8 +209,8 @@ def _solve(
         last = repeat_while(lambda state: state.open, step, constants, first, steps="recursion")
         x, u, y, count = last.x, last.u, last.y, last.steps
     s = expanded(base, problem, x, u)
-    measured, E, rho = jax.lax.stop_gradient(scaled(s, scale))
-    s = replace(s, gain=measured.gain)
+    measured, E = jax.lax.stop_gradient(scaled(s, scale))
+    rho, s = penalty(s, E), replace(s, gain=measured.gain)
     if iterations == 1:
         gains = None
         if solver.admm_steps():
@@ -281,16 +280,9 @@ def with_tasks(plan: Plan, s: Stages, base: Stages, problem: NonlinearMPC, x: Ar
     return replace(plan, cost=J, slack=jnp.concatenate(slack, axis=1))
 
 
-def scaled(s: Stages, scale: Array | None) -> tuple[Stages, Array, Array]:
-    """Return the expansion with the gain that its moves have, unless a row scale is given, and the
-    row scale E (rows,) and the penalty ρ (rows,)."""
-    if scale is None:
-        free = riccati(s)
-        E, s = row_scale(s, free), replace(s, gain=stabilising_gain(s, free))
-    else:
-        E = jnp.asarray(scale, s.P.dtype)
-    rho = default_rho(E, s.horizon * s.B.shape[-1])
-    return s, E, jnp.broadcast_to(rho, E.shape)
+def penalty(s: Stages, E: Array) -> Array:
+    """Return the penalty ρ (rows,) for the row scale E (rows,)."""
+    return jnp.broadcast_to(default_rho(E, s.horizon * s.B.shape[-1]), E.shape)
 
 
 @pytree
@@ -451,8 +443,8 @@ def sqp_step(most: int, hessian: str, constants: tuple, state: Iterate) -> Itera
     """
     base, problem, scale, eps = constants
     x, u, y = state.x, state.u, state.y
-    s, E, rho = scaled(expanded(base, problem, x, u), scale)
-    y, v = s.bounds.admissible(y), s.moves(x, u)
+    s, E = scaled(expanded(base, problem, x, u), scale)
+    rho, y, v = penalty(s, E), s.bounds.admissible(y), s.moves(x, u)
     residuals, floor = nonlinear_residuals, rounding(x.dtype)
     measure = lambda s, E, v, y, eps: Measured.of(residuals(s, E, v, y), eps, floor)
     solved = precisely(measure, s, E, v, y, eps / 10).within_tolerance
