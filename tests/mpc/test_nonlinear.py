@@ -538,6 +538,15 @@ def test_unstable_models_are_solved_as_linear_ones_are(x64):
         np.testing.assert_allclose(wrong[solved], 0.0, atol=1e-4)
 
 
+@pytest.mark.long
+def test_inputs_are_finite_where_the_model_overflows(x64):
+    """Nothing is SOLVED there, but what a controller applies is a number."""
+    steep = NonlinearMPC(around().mpc, lambda x, u: 1e200 * x + u)
+    for iterations in (1, 5):
+        plan = solve_nonlinear(steep, START, iterations=iterations)
+        assert plan.status != SOLVED and np.isfinite(plan.inputs).all()
+
+
 @pytest.mark.slow  # its programs, stage by stage, are those of `test_interior_point.py`
 def test_the_best_dose_may_be_none(x64):
     """u ≥ 0 without another limit: all states, and all costs, are least for u = 0."""

@@ -211,6 +211,8 @@ def _solve(
     s = expanded(base, problem, x, u)
     measured, E = jax.lax.stop_gradient(scaled(s, scale))
     rho, s = penalty(s, E), replace(s, gain=measured.gain)
+    # Where the expansion overflows nothing is solved, and what is applied is a number still.
+    or_start = lambda planned, u=u: jnp.where(jnp.isfinite(planned), planned, u)
     if iterations == 1:
         gains = None
         if solver.admm_steps():
@@ -218,11 +220,11 @@ def _solve(
         factor = StageFactor(s, E, rho[None], gains, fault)
         found = stage_solution(factor, s, solver, WarmStart(x, u, y))
         x = predict(s, found.z)
-        u = s.inputs(x, found.z)
+        u = or_start(s.inputs(x, found.z))
     else:
         moves = measured.moves(x, u)
         x = predict(measured, moves)
-        z = jnp.concatenate([x.ravel(), measured.inputs(x, moves).ravel()])
+        z = jnp.concatenate([x.ravel(), or_start(measured.inputs(x, moves)).ravel()])
         z, y = implicit(nonlinear_conditions, (base, problem), (E, rho, measured.gain), z, y)
         x, u = _states_inputs(s, z)
         y = s.bounds.following(y, E, s.rows(x, u))
