@@ -37,6 +37,8 @@ from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.jax_transformations import own_modes, varying
 from jaxmpc.qp.linalg import arrays, matmul
 from jaxmpc.qp.status import Status
+from jaxmpc.robots.parameters import require_numbers
+from jaxmpc.robots.robot import Robot
 from jaxmpc.sets.limits import worst_violation
 from jaxmpc.systems.given_model import as_argument, is_model
 from jaxmpc.systems.system import LinearSystem
@@ -568,7 +570,9 @@ def require_variations(plant: Any, variations: Mapping[str, Any], count: int) ->
             fail(f"variations[{key!r}]", f"shape {np.shape(value)}", f"Put {count} in front")
     if variations and not hasattr(plant, "vary"):
         fail("variations", f"given for a {type(plant).__name__}", "Give a Robot or LinearPlant")
-    if variations:  # the plant checks names and shapes
+    if isinstance(plant, Robot):
+        require_numbers(plant.plant, variations, (count,))
+    elif variations:  # the plant checks names and shapes
         plant.vary(**{key: np.asarray(value)[0] for key, value in variations.items()})
 
 

@@ -18,6 +18,7 @@ from jaxmpc.files import check_results, fingerprint
 from jaxmpc.pytrees import record
 from jaxmpc.qp.status import Status
 from jaxmpc.robots.load import model_hash
+from jaxmpc.robots.parameters import require_numbers
 from jaxmpc.robots.robot import Robot
 
 if TYPE_CHECKING:
@@ -120,7 +121,7 @@ class _Loops:
         initial_states(self.robot, self.x0s)
         if self.factors:
             numbers = plant_numbers(self.robot, self.factors)
-            self.robot.vary(**{key: value[0] for key, value in numbers.items()})
+            require_numbers(self.robot.plant, numbers, (len(self.x0s),))
 
     def settings(self) -> dict[str, Any]:
         """Return what determines the runs, as hashes."""

@@ -13,7 +13,8 @@ from jaxmpc.robots.couplings import Couplings
 from jaxmpc.robots.description import host_coordinates
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.mujoco_access import names, number_of
-from jaxmpc.robots.robot import Robot, tool_of
+from jaxmpc.robots.parameters import require_tool
+from jaxmpc.robots.robot import Robot
 
 # Of each quantity, the field of MuJoCo's model that its factor multiplies and whose it is. The
 # order decides the random numbers: add at the end.
@@ -47,9 +48,8 @@ def randomised(
     require_kind("robot", robot, Robot)
     for name, (quantity, places) in _named(robot, ranges).items():
         field = QUANTITIES[quantity][0]
-        if field is not None and not np.any(np.asarray(getattr(robot.mujoco, field))[places]):
-            cure = f"Set {field} in the file, or leave it out"
-            fail(name, f"is a factor of {field}, which is 0 in {robot.name}", cure)
+        if field is not None:
+            _require_there(robot, name, field, places)
     return plant_numbers(robot, draw_factors(robot, count, seed, ranges))
 
 
@@ -119,10 +119,18 @@ def plant_numbers(robot: Robot, factors: Mapping[str, np.ndarray]) -> dict[str, 
             found[quantity] = factor
             continue
         value = np.asarray(getattr(robot.mujoco, field))
+        _require_there(robot, quantity, field, np.arange(len(value)))
         found[field] = factor.reshape(*factor.shape, *(1,) * (value.ndim - 1)) * value
         if quantity == "mass":
             found["body_inertia"] = factor[..., None] * robot.mujoco.body_inertia
     return found
+
+
+def _require_there(robot: Robot, name: str, field: str, places: np.ndarray) -> None:
+    """Raise ValueError for a factor of numbers that are all zero."""
+    if not np.any(np.asarray(getattr(robot.mujoco, field))[places]):
+        cure = f"Set {field} in the file, or leave it out"
+        fail(name, f"is a factor of {field}, which is 0 in {robot.name}", cure)
 
 
 def _named(robot: Robot, ranges: Mapping[str, Any]) -> dict[str, tuple[str, np.ndarray]]:
@@ -142,7 +150,7 @@ def _named(robot: Robot, ranges: Mapping[str, Any]) -> dict[str, tuple[str, np.n
         size = 0 if field is None else len(getattr(robot.mujoco, field))
         places = np.arange(size)
         if quantity == "payload":
-            tool_of(robot)
+            require_tool(robot.mujoco)
         if owner:
             places = _places(robot, name, owner[0], str(kind))
         found[name] = quantity, places

@@ -190,13 +190,14 @@ class StandingPhysics(Physics):
     def __init__(self, model: "mujoco.MjModel", feet: Feet) -> None:
         super().__init__(model)
         self.feet = feet
+        self.own |= {STANDING: (len(feet),)}
 
     def _rates(self, numbers: dict[str, Array], q: Array, v: Array, act: Array, u: Array) -> Array:
         return self._standing(numbers, q, v, act, u)[0]
 
-    def _forced(self, numbers: dict[str, Array], *point: Array) -> tuple[Any, Any]:
-        of_model = {key: value for key, value in numbers.items() if key != STANDING}
-        return super()._forced(of_model, *point)
+    def of(self, model: "mujoco.MjModel") -> "StandingPhysics":
+        """Return the same feet on another model."""
+        return StandingPhysics(model, self.feet)
 
     def contact_forces(self, x: Array, u: Array, numbers: dict[str, Array] | None = None) -> Array:
         """Return the contact forces λ (3k,), normal and two tangential ones of each foot (N), at

@@ -87,9 +87,10 @@ def load_robot(
 
     Defaults where the file lacks `<numeric name="velocity_limit">`, `<numeric name=
     "control_period">` and `<key name="home">`: none, 10 ms (rounded to physics steps), and the
-    model's qpos0 moved inside the joint ranges. Input limits are the narrowest of `ctrlrange`,
-    and for motors `forcerange` and the joint's `actuatorfrcrange`. Other limits of forces, those of
-    servos, become rows in ξ and u of `robot_mpc`.
+    first key of another name, or without any the model's qpos0 moved inside the joint ranges. Input
+    limits are the narrowest of `ctrlrange`, and for motors `forcerange` and the joint's
+    `actuatorfrcrange`. Other limits of forces, those of servos, become rows in ξ and u of
+    `robot_mpc`.
 
     Shapes of an MJCF file whose meshes are missing are left out, with a UserWarning, where their
     bodies have inertias of their own.
@@ -110,6 +111,7 @@ def load_robot(
     host, name = file.model, file.name
     _require_plant(host, name)
     substeps, period = _periods(host, control_period, timestep)
+    _place_mocap(host)
     if not contacts:
         host.opt.disableflags |= flag("contact")
     given = copy.deepcopy(host)
@@ -118,6 +120,8 @@ def load_robot(
     missing = lacks(host)
     for lack in missing:
         lack.take_out(host)
+    flags = ("actuator_forcelimited", "jnt_actfrclimited")
+    limited = {key: getattr(host, key).astype(bool) for key in flags}
     inputs, input_sources = input_limits(host)
     limits = overridden("torque", inputs, torque, slice(None))
     if torque is not None:
@@ -133,7 +137,7 @@ def load_robot(
     require_printable("model", name, *labels)
     states, sources = state_limits(host, position, velocity, file.velocities)
     q, act, origin = _home(host, home)
-    start, plant = np.concatenate([q, np.zeros(host.nv), act]), Physics(host)
+    start, plant = np.concatenate([q, np.zeros(host.nv), act]), Physics(host, limited)
     _warn_of_meshes(name, host)
     input_names = tuple(named(host, "actuator", "u"))
     _warn_of_limits(name, [*labels, *input_names], [*sources, *input_sources])
@@ -329,7 +333,7 @@ def _is_urdf(model: str | Path) -> bool:
 def _home(host: "mujoco.MjModel", home: Reals | None) -> tuple[np.ndarray, np.ndarray, str]:
     """Return qpos, act and the source: the argument, else the key "home", else the first key, else
     qpos0 moved inside the ranges and zeros. Raises ValueError for a wrong argument."""
-    act, key = np.zeros(host.na), max(number_of(host, "key", "home"), 0)
+    act, key = np.zeros(host.na), _home_key(host)
     q, source = host.qpos0.copy(), "file, qpos0"
     if host.nkey:
         q, act = host.key_qpos[key].copy(), host.key_act[key].copy()
@@ -345,6 +349,22 @@ def _home(host: "mujoco.MjModel", home: Reals | None) -> tuple[np.ndarray, np.nd
         require_finite("home", home)
         q, source = unit_orientations("home", host.jnt_type, np.array(home, float)), "argument"
     return q, act, source
+
+
+def _home_key(host: "mujoco.MjModel") -> int:
+    """Return the number of the key "home", of the first one where no other has that name."""
+    return max(number_of(host, "key", "home"), 0)
+
+
+def _place_mocap(host: "mujoco.MjModel") -> None:
+    """Put the bodies that nothing but the user moves ("mocap") where the key for home has them: the
+    plant leaves them there."""
+    if not host.nkey:
+        return
+    bodies, key = np.flatnonzero(host.body_mocapid >= 0), _home_key(host)
+    order = host.body_mocapid[bodies]
+    host.body_pos[bodies] = host.key_mpos[key].reshape(-1, 3)[order]
+    host.body_quat[bodies] = host.key_mquat[key].reshape(-1, 4)[order]
 
 
 def _anchor(host: "mujoco.MjModel", home: np.ndarray) -> tuple[float, ...]:
@@ -652,7 +672,10 @@ def _velocities(root: ElementTree.Element) -> dict[str, float]:
             raise ValueError(f"joint {name} has the range [{lower:g}, {upper:g}]")
         if not (effort >= 0 and velocity >= 0):
             raise ValueError(f"joint {name} has the effort {effort:g}, the velocity {velocity:g}")
-        found[name] = velocity or np.inf
+        # MuJoCo makes two slides of these names and a hinge of a planar joint.
+        planar = [f"{name}_TX", f"{name}_TY"]
+        for part in planar if joint.get("type") == "planar" else [name]:
+            found[part] = velocity or np.inf
     return found
 
 

@@ -18,6 +18,7 @@ from jaxmpc.qp.linalg import matmul, solve, stand_ins
 from jaxmpc.robots.configurations import normalised, rates, retract
 from jaxmpc.robots.jaxpr_rewriting import in_pieces, moving, rewritten, with_forward_jacobian
 from jaxmpc.robots.mujoco_access import BALL, mjx_module, mujoco
+from jaxmpc.robots.parameters import FRICTIONS, PAYLOAD, TINY, acting_fields
 from jaxmpc.robots.rigid_bodies import (
     FIELDS,
     Tree,
@@ -41,24 +42,30 @@ class Physics:
     """A mujoco.MjModel and its mjx.Model; two are equal only if they are the same object.
 
     model: the mujoco.MjModel. mjx: mjx.Model with NumPy arrays, in float64 in either mode of JAX.
-    Raises ValueError for models that MJX does not support.
+    limited: fields of the file that say which forces are limited, in force where numbers from which
+    `load_robot` made limits of inputs vary. Raises ValueError for models that MJX does not support.
 
     Inertia, velocities and their forces are those of `rigid_bodies.py`; MJX gives the forces of
     springs, tendons and actuators, the rows of constraints and their solver.
     """
 
-    def __init__(self, model: "mujoco.MjModel") -> None:
+    def __init__(
+        self, model: "mujoco.MjModel", limited: Mapping[str, np.ndarray] | None = None
+    ) -> None:
         # Sparse matrices hold what the file's numbers fill, and `numbers` may fill more.
-        self.model = model = copy.copy(model)
+        self.model, self.limited = (model := copy.copy(model)), dict(limited or {})
         model.opt.jacobian = DENSE
+        self._acting: dict[frozenset[str], Physics] = {}
+        self.own: dict[str, tuple[int, ...]] = {PAYLOAD: ()}  # shapes of numbers beside mjx.Model's
         self.joints = tuple(int(joint) for joint in model.jnt_type)
         self.tree = Tree.of(model)
         try:
-            with warnings.catch_warnings(), jax.enable_x64(True):
+            # Also where a program that needs it is being traced, see `acting`.
+            outside = jax.ensure_compile_time_eval()
+            with warnings.catch_warnings(), jax.enable_x64(True), outside:
                 warnings.simplefilter("ignore")
                 mjx = mjx_module()
                 self.mjx: Any = jax.tree.map(np.asarray, mjx.put_model(model, impl="jax"))
-                self.mjx = self.mjx.replace(**_without_margins(self.mjx))
                 blank = mjx.make_data(model, impl="jax")
         except NotImplementedError as error:
             fluid = "fluid" in str(error)
@@ -79,14 +86,33 @@ class Physics:
         cannot be pickled.)"""
         return TAMED if self.rows or self.model.ntendon else {}
 
+    def acting(self, numbers: Mapping[str, Any]) -> "Physics":
+        """Return the physics in whose programs these numbers act; the same one for the same names,
+        so that compiled programs are found again."""
+        fields = acting_fields(self.model, self.limited, numbers)
+        if not fields:
+            return self
+        if (key := frozenset(fields)) not in self._acting:
+            model = copy.copy(self.model)
+            for name, value in fields.items():
+                setattr(model, name, value)
+            self._acting[key] = self.of(model)
+        return self._acting[key]
+
+    def of(self, model: "mujoco.MjModel") -> "Physics":
+        """Return the same kind of physics of another model."""
+        return Physics(model, self.limited)
+
     def step(self, x: Array, u: Array, numbers: Mapping[str, Any] | None = None) -> Array:
         """Return x = (qpos, qvel, act) one physics step later: a function of x, u and nothing
         carried along.
 
-        numbers: fields of mjx.Model to replace. Differentiable in all three, forward and reverse;
-        with constraints by `with_forward_jacobian`. Computed in float64 where 64-bit mode is on, as
-        MJX's own numbers are then, and returned in the type of x.
+        numbers: fields of mjx.Model to replace, see `parameters.py`. Differentiable in all three,
+        forward and reverse; with constraints by `with_forward_jacobian`. Computed in float64 where
+        64-bit mode is on, as MJX's own numbers are then, and returned in the type of x.
         """
+        if (physics := self.acting(numbers or {})) is not self:
+            return physics.step(x, u, numbers)
         dtype = x.dtype
         x, u, numbers = _widest((x, u, dict(numbers or {})))
         step = in_pieces(rewritten(self._step, {**stand_ins(), **self.tamed}))
@@ -115,13 +141,18 @@ class Physics:
 
     def data(self, x: Array, u: Array, numbers: Mapping[str, Any] | None = None) -> Any:
         """Return mjx.Data at x = (qpos, qvel, act) under u: poses and velocities of bodies, geoms
-        and sites, forces of actuators and springs (qfrc_actuator, qfrc_passive), qfrc_bias.
+        and sites, forces of actuators and springs (qfrc_actuator, qfrc_passive), qfrc_bias,
+        inertias of bodies and of the whole (_impl.cinert, _impl.M).
         Differentiable."""
+        if (physics := self.acting(numbers or {})) is not self:
+            return physics.data(x, u, numbers)
         x, u, own = _widest((x, u, dict(numbers or {})))
         x_q, v, act = jnp.split(x, [self.model.nq, self.model.nq + self.model.nv])
         q = normalised(self.joints, x_q)
-        _, bias, poses = self._dynamics(own, q, v)
-        return self._forced(own, q, v, act, u)[1].replace(qfrc_bias=bias, **poses)
+        M, bias, poses = self._dynamics(own, q, v)
+        model, data = self._forced(own, q, v, act, u)
+        M = M + self._added(model, data, False)
+        return data.replace(qfrc_bias=bias).tree_replace({**poses, "_impl.M": M})
 
     def balance(self, x: Array, u: Array) -> tuple[Array, Array]:
         """Return M (nv, nv) and the force f (nv,) at x = (qpos, qvel) under u: a step of an Euler
@@ -222,10 +253,13 @@ class Physics:
         )
         # A copy for each program. JAX caches by identity how it converted NumPy arrays, also for
         # programs of the other precision, and MJX passes it arrays of the model.
-        model = cast(copy.deepcopy(self.mjx).replace(**numbers))
+        of_model = {key: value for key, value in numbers.items() if hasattr(self.mjx, key)}
+        of_model |= {key: v + TINY for key, v in of_model.items() if key in FRICTIONS}
+        model = copy.deepcopy(self.mjx).replace(**of_model)
+        model = cast(model.replace(**_without_margins(model)))
         data = cast(mjx.make_data(self.model, impl="jax")).replace(qpos=q, qvel=v, act=act, ctrl=u)
         if self.posed:
-            data = data.replace(**self._dynamics(numbers, q, v)[2])
+            data = data.tree_replace(self._dynamics(numbers, q, v)[2])
             data = mjx.tendon(model, data)
             data = mjx.collision(model, data) if self.rows else data
         data = mjx.transmission(model, mjx.make_constraint(model, data))
@@ -255,7 +289,7 @@ class Physics:
         own = {
             key: unit(value) if key.endswith("quat") else value
             for key, value in numbers.items()
-            if key in FIELDS
+            if key in (*FIELDS, PAYLOAD)
         }
         call = lambda own, *rest: function(self.tree, {**fixed, **own}, *rest)
         return side_by_side(call)(jax.tree.map(lambda v: jnp.asarray(v, q.dtype), own), q, *rest)
@@ -318,14 +352,15 @@ def _without_saturated(model: Any, data: Any) -> Any:
     return model.replace(**{name: still(getattr(model, name)) for name in names})
 
 
-def _without_margins(model: Any) -> dict[str, np.ndarray]:
+def _without_margins(model: Any) -> dict[str, Any]:
     """Return the ranges of joints and tendons, narrowed by their margins, and no margins: MJX
     subtracts the margin of a stop twice. A ball joint has an upper end only."""
-    fields = {}
+    fields: dict[str, Any] = {}
     for kind, two in (("jnt", model.jnt_type != BALL), ("tendon", np.ones(model.ntendon))):
         margin, ends = getattr(model, f"{kind}_margin"), getattr(model, f"{kind}_range")
-        fields[f"{kind}_range"] = ends + np.stack([margin * two, -margin], axis=1)
-        fields[f"{kind}_margin"] = np.zeros_like(margin)
+        inwards = np.stack([two, -np.ones(len(two))], axis=1)
+        fields[f"{kind}_range"] = ends + margin[:, None] * inwards
+        fields[f"{kind}_margin"] = np.zeros(margin.shape)
     return fields
 
 

@@ -35,9 +35,10 @@ from jax import Array
 
 from jaxmpc.pytrees import record
 from jaxmpc.qp.jax_transformations import batched_by
-from jaxmpc.robots.mujoco_access import BALL, FREE, SLIDE
+from jaxmpc.robots.mujoco_access import BALL, FREE, SLIDE, number_of
+from jaxmpc.robots.parameters import PAYLOAD, TOOL
 
-# What is read of mjx.Model.
+# What is read of mjx.Model; beside it the payload, a point mass at the site "tool".
 FIELDS = (
     *("body_pos", "body_quat", "body_ipos", "body_iquat", "body_mass", "body_inertia"),
     *("jnt_pos", "jnt_axis", "geom_pos", "geom_quat", "site_pos", "site_quat"),
@@ -57,6 +58,7 @@ class Tree:
     1 for a rotation, 0 for a shift.
     moves (bodies, nv), before, after (nv, nv): 1 where dof j moves body i; where it comes before
     the joint of dof i; where it moves the axis of dof i. Dofs of a ball joint move one another.
+    tool: the site that holds the payload, −1 for none.
     """
 
     parent: np.ndarray
@@ -78,6 +80,7 @@ class Tree:
     geom_body: np.ndarray
     site_body: np.ndarray
     below: np.ndarray
+    tool: int
 
     @classmethod
     def of(cls, model: Any) -> "Tree":
@@ -125,13 +128,13 @@ class Tree:
         masks = {"first": first, "moves": moves, "before": before, "below": below}
         masks |= {"after": acts * (1 - before.T), "turns": np.array(turns, float)}
         whole = {name: np.array(value, np.int32) for name, value in numbers.items()}
-        return cls(**whole, **masks)
+        return cls(**whole, **masks, tool=number_of(model, "site", TOOL))
 
 
 class Bodies(NamedTuple):
     """Poses and what moves them: position (bodies, 3), quaternion (bodies, 4), matrix (bodies, 3,
     3), the same of the principal axes of inertia about the centre of mass; centre (bodies, 3) of
-    mass of each subtree; S (nv, 6)."""
+    mass of each subtree; S (nv, 6); tool (1, 3), the place of the payload, None without one."""
 
     position: Array
     quaternion: Array
@@ -140,6 +143,7 @@ class Bodies(NamedTuple):
     principal: Array
     centre: Array
     S: Array
+    tool: Array | None
 
 
 class Motion(NamedTuple):
@@ -265,8 +269,14 @@ def bodies(tree: Tree, model: Mapping[str, Any], q: Array) -> Bodies:
         anchor = anchor + rotated(r[tree.link], pivot)
     middle = position + rotated(quaternion, model["body_ipos"])
     principal = matrix(product(quaternion, jnp.asarray(model["body_iquat"])))
-    mass = model["body_mass"][:, None]
-    below, weight = total(tree.below, mass * middle), total(tree.below, mass)
+    mass, tool = jnp.asarray(model["body_mass"])[:, None], None
+    weighed = mass * middle
+    if PAYLOAD in model:
+        carrier = tree.site_body[[tree.tool]]
+        tool = position[carrier] + rotated(quaternion[carrier], model["site_pos"][[tree.tool]])
+        weighed = weighed.at[carrier].add(model[PAYLOAD] * tool)
+        mass = (mass + 0 * model[PAYLOAD]).at[carrier].add(model[PAYLOAD])
+    below, weight = total(tree.below, weighed), total(tree.below, mass)
     # MuJoCo's smallest mass that counts is 1e-15.
     centre = jnp.where(weight < 1e-15, middle, below / jnp.maximum(weight, 1e-15))
     if np.max(tree.axis) < len(tree.link):
@@ -281,7 +291,7 @@ def bodies(tree: Tree, model: Mapping[str, Any], q: Array) -> Bodies:
     else:
         shift = turns * cross(along, arm) + (1 - turns) * along
         S = jnp.concatenate([turns * along, shift], axis=1)
-    return Bodies(position, quaternion, R, middle, principal, centre, S)
+    return Bodies(position, quaternion, R, middle, principal, centre, S, tool)
 
 
 @unfused
@@ -311,10 +321,22 @@ def inertias(tree: Tree, model: Mapping[str, Any], found: Bodies) -> Inertia:
     """Return the inertia of each body about the centre of mass of its tree."""
     arm, mass = found.middle - found.centre[tree.root], jnp.asarray(model["body_mass"])
     X, moments = found.principal, model["body_inertia"][:, None, :]
-    J = jnp.sum((X * moments)[:, :, None] * X[:, None], axis=3)
+    own = jnp.sum((X * moments)[:, :, None] * X[:, None], axis=3)
+    J, h, mass = _of_points(mass, arm)
+    J = own + J
+    if found.tool is not None:
+        carrier = tree.site_body[[tree.tool]]
+        held = _of_points(model[PAYLOAD][None], found.tool - found.centre[tree.root[carrier]])
+        J, h = J.at[carrier].add(held.J), h.at[carrier].add(held.h)
+        mass = (mass + 0 * held.mass).at[carrier].add(held.mass)
+    return Inertia(J, h, mass)
+
+
+def _of_points(mass: Array, arm: Array) -> Inertia:
+    """Return the inertia of points (n,) at `arm` (n, 3, lanes) from the centre."""
     identity = np.eye(3, dtype=arm.dtype)[:, :, None]
     squared = jnp.sum(arm * arm, axis=1)[:, None, None]
-    J = J + mass[:, None, None] * (squared * identity - arm[:, :, None] * arm[:, None])
+    J = mass[:, None, None] * (squared * identity - arm[:, :, None] * arm[:, None])
     return Inertia(J, mass[:, None] * arm, mass)
 
 
@@ -371,7 +393,8 @@ def inverse_dynamics(tree: Tree, model: Mapping[str, Any], q: Array, v: Array, a
 def dynamics(
     tree: Tree, model: Mapping[str, Any], q: Array, v: Array
 ) -> tuple[Array, Array, dict[str, Array]]:
-    """Return M (nv, nv, lanes), bias (nv, lanes) and fields of mjx.Data by name."""
+    """Return M (nv, nv, lanes), bias (nv, lanes) and fields of mjx.Data by name, for its method
+    tree_replace."""
     found = bodies(tree, model, q)
     inertia, moving = inertias(tree, model, found), motion(tree, found.S, v)
     force, _ = forces(tree, inertia, moving, model["gravity"], v, None)
@@ -381,11 +404,21 @@ def dynamics(
     fields = {"xpos": found.position, "xquat": found.quaternion, "xmat": found.matrix}
     fields |= {"xipos": found.middle, "ximat": found.principal, "subtree_com": found.centre}
     fields |= {"cdof": S, "cdof_dot": moving.psi, "cvel": moving.velocity}
+    fields["_impl.cinert"] = _packed(inertia)
     for kind, body in (("geom", tree.geom_body), ("site", tree.site_body)):
         turn = found.quaternion[body]
         fields[f"{kind}_xpos"] = found.position[body] + rotated(turn, model[f"{kind}_pos"])
         fields[f"{kind}_xmat"] = matrix(product(turn, jnp.asarray(model[f"{kind}_quat"])))
     return M, jnp.sum(S * F, axis=1), fields
+
+
+def _packed(inertia: Inertia) -> Array:
+    """Return inertias (n, 10, lanes) as MuJoCo has them: J_xx, J_yy, J_zz, J_xy, J_xz, J_yz, h and
+    the mass."""
+    J, h, mass = inertia
+    rows, columns = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]
+    parts = [J[:, rows, columns], h, jnp.broadcast_to(mass[:, None], (len(h), 1, h.shape[-1]))]
+    return jnp.concatenate(parts, axis=1)
 
 
 def _diagonal(v: Any) -> Array:

@@ -10,7 +10,7 @@ controller has to keep u inside `input_limits`.
 """
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import field, replace
 from typing import Any
 
@@ -18,13 +18,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.scipy.spatial.transform import Rotation
 
 from jaxmpc.arrays import host_array
 from jaxmpc.checks import fail, require_finite, require_shape
 from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.jax_transformations import own_modes, varying
-from jaxmpc.qp.linalg import eigh, matmul
+from jaxmpc.qp.linalg import matmul
 from jaxmpc.robots.configurations import difference, quaternions, retract
 from jaxmpc.robots.contacts import standing_physics
 from jaxmpc.robots.couplings import MET, Couplings
@@ -37,7 +36,8 @@ from jaxmpc.robots.equilibria import (
     rest_at,
     settled,
 )
-from jaxmpc.robots.mujoco_access import equalities, number_of
+from jaxmpc.robots.mujoco_access import equalities
+from jaxmpc.robots.parameters import require_numbers
 from jaxmpc.systems.system import LinearSystem
 
 
@@ -89,6 +89,7 @@ class Robot(RobotDescription):
         mjx.Model in place of the predictor's own, see `vary`.
         """
         exact = exact or bool(equalities(self.predictor.model))
+        require_numbers(self.predictor, numbers or {})
         return _linearized(self, *self.checked_arrays(x, u), numbers or {}, exact=exact)
 
     def _linearize(self, x: Array, u: Array, numbers: dict[str, Any], exact: bool) -> LinearSystem:
@@ -308,25 +309,15 @@ class Robot(RobotDescription):
         theirs.
 
         numbers: fields of mjx.Model by name, such as body_mass (nbody,), dof_damping (nv,),
-        dof_armature, actuator_gear, dof_frictionloss (where the file has some); or payload (kg): a
+        dof_armature, actuator_gear, all of `jaxmpc.robots.parameters.FIELDS`; or payload (kg): a
         point mass at the site "tool", a number. Works under `jax.vmap`, which is how a batch gets
         a robot each; the inverse weights that shape MuJoCo's soft limits stay those of the file.
+        With other gears, gains or ranges of forces the plant clamps forces as its file says.
+        Each acts as in MuJoCo's C engine. Raises ValueError for other names and shapes, and for
+        negative masses.
         """
-        payload = numbers.pop("payload", None)
-        for key, value in numbers.items():
-            present: Any = getattr(self.plant.mjx, key, None)
-            if key.startswith("_") or not hasattr(present, "shape"):
-                fail(key, "is no array of mjx.Model", "Give fields such as body_mass, dof_damping")
-            require_shape(key, value, np.shape(present), "As in robot.plant.mjx")
-            require_finite(key, value)
-            if key == "dof_frictionloss" and not np.all(present > 0):
-                cure = "Give those joints a little frictionloss in the file"
-                fail(key, "is zero for some joints of the file, which then have no such row", cure)
-        varied = {**self.numbers, **numbers}
-        if payload is not None:
-            require_shape("payload", payload, (), "Mass in kg")
-            varied |= with_payload(self.plant.mjx, varied, tool_of(self), payload)
-        return replace(self, numbers=varied)
+        require_numbers(self.plant, numbers)
+        return replace(self, numbers={**self.numbers, **numbers})
 
 
 # Compiled once a robot, also where the user calls them outside `jit`.
@@ -339,7 +330,7 @@ _differentiated = jax.jit(own_modes(Robot._transition))
 class RobotModel:
     """The predictor of a robot (no contacts, no joint limits) in the coordinates ξ.
 
-    numbers: fields of mjx.Model in place of the file's, as in `Robot.vary` (masses, damping), with
+    numbers: in place of the file's, those of `Robot.vary` (masses, damping, payload), with
     respect to which plans can be differentiated. exact: see `Robot.linearize`; sequential quadratic
     programming needs it.
     """
@@ -351,6 +342,7 @@ class RobotModel:
     def step(self, xi: Array, u: Array) -> Array:
         """Return ξ (n,) one control period later."""
         robot = self.robot
+        require_numbers(robot.predictor, self.numbers)
         advance = lambda x, _: (robot.predictor.step(x, u, self.numbers), None)
         return robot.coordinates(jax.lax.scan(advance, robot.state(xi), length=robot.substeps)[0])
 
@@ -364,39 +356,5 @@ class RobotModel:
         geoms and sites, the forces of actuators and springs."""
         robot = self.robot
         x = jnp.asarray(robot.state(xi))
+        require_numbers(robot.predictor, self.numbers)
         return robot.predictor.data(x, u, self.numbers)
-
-
-def tool_of(robot: Robot) -> int:
-    """Return the number of the site "tool", which holds payloads. ValueError without one."""
-    site = number_of(robot.mujoco, "site", "tool")
-    if site < 0:
-        what = f"{robot.name} has no site named tool"
-        fail("payload", what, 'Add <site name="tool"/> to the body that holds loads')
-    return site
-
-
-def with_payload(
-    model: Any, varied: Mapping[str, Any], site: int, payload: Any
-) -> dict[str, Array]:
-    """Return the fields of mjx.Model that a point mass (kg) at a site changes: parallel axes about
-    the new centre (Steiner), then principal axes. varied: fields in place of the model's."""
-    i, at = int(model.site_bodyid[site]), jnp.asarray(model.site_pos[site])
-    of = lambda key: jnp.asarray(varied.get(key, getattr(model, key)))
-    mass, centre = of("body_mass")[i], of("body_ipos")[i]
-    total = mass + payload
-    middle = (mass * centre + payload * at) / total
-    turn = Rotation.from_quat(jnp.roll(of("body_iquat")[i], -1)).as_matrix()
-    inertia = matmul(turn * of("body_inertia")[i], turn.T)
-    for m, place in ((mass, centre), (payload, at)):
-        arm = place - middle
-        inertia = inertia + m * (jnp.sum(arm**2) * jnp.eye(3) - jnp.outer(arm, arm))
-    principal, axes = eigh(inertia)
-    axes = axes * jnp.sign(jnp.linalg.det(axes))
-    new = {
-        "body_mass": total,
-        "body_ipos": middle,
-        "body_inertia": principal,
-        "body_iquat": jnp.roll(Rotation.from_matrix(axes).as_quat(), 1),
-    }
-    return {key: of(key).at[i].set(value) for key, value in new.items()}

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from jaxmpc.checks import fail, require_finite, require_shape
 from jaxmpc.qp.linalg import matmul
 from jaxmpc.robots.mujoco_access import names, number_of
+from jaxmpc.robots.physics import NO_GRAVITY
 from jaxmpc.robots.robot import Robot
 
 # mjtGeom.
@@ -90,21 +91,18 @@ def distance(robot: Robot, first: str, second: Any) -> Callable[[Any], Array]:
 
 def energy(robot: Robot) -> Callable[[Any], Array]:
     """Return the function that gives the kinetic energy and that of the weight (J), zero at rest at
-    the height of the world's origin; without springs."""
+    the height of the world's origin; without springs. Its masses are those of the model that is
+    planned with, `numbers` and a payload included."""
     model = robot.predictor.mjx
-    mass, inertia = np.asarray(model.body_mass), np.asarray(model.body_inertia)
-    gravity, root = np.asarray(model.opt.gravity), np.asarray(model.body_rootid)
-    armature = np.asarray(model.dof_armature)
+    gravity = np.asarray(model.opt.gravity) * (not model.opt.disableflags & NO_GRAVITY)
+    root = np.asarray(model.body_rootid)
 
     def total(data: Any) -> Array:
-        cast = lambda v: jnp.asarray(v, data.qpos.dtype)
-        turn, shift = data.cvel[:, :3], data.cvel[:, 3:]
-        # cvel is that of the point of the body at the centre of its tree.
-        speed = shift + jnp.cross(turn, data.xipos - data.subtree_com[root])
-        own = jnp.einsum("bji,bj->bi", data.ximat.reshape(-1, 3, 3), turn, precision="highest")
-        kinetic = jnp.sum(cast(mass) * jnp.sum(speed**2, 1)) + jnp.sum(cast(inertia) * own**2)
-        kinetic = kinetic + jnp.sum(cast(armature) * data.qvel**2)
-        return kinetic / 2 - jnp.sum(cast(mass) * matmul(data.xipos, cast(gravity)))
+        # Inertias about the centre of each body's tree: m·arm, mass m.
+        arms, mass = data._impl.cinert[:, 6:9], data._impl.cinert[:, 9:]
+        first_moment = jnp.sum(mass * data.subtree_com[root] + arms, axis=0)
+        kinetic = jnp.dot(data.qvel, matmul(data._impl.M, data.qvel)) / 2
+        return kinetic - jnp.dot(first_moment, jnp.asarray(gravity, data.qpos.dtype))
 
     return total
 

@@ -28,6 +28,7 @@ from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.linalg import float64_arrays
 from jaxmpc.qp.status import Status
 from jaxmpc.robots.linear_plant import LinearPlant
+from jaxmpc.robots.parameters import require_numbers
 from jaxmpc.robots.robot import Robot
 from jaxmpc.sets.convex_sets import Box, Polytope
 from jaxmpc.sets.limits import TOLERANCE, rows_kept
@@ -279,8 +280,7 @@ def robot_task(
     reference, input_reference = robot_references(robot, target)
     loss = weight_loss(mpc.Q, mpc.R, robot.state_limits, reference, input_reference, robot, **terms)
     variations = plant_numbers(robot, dict(factors or {}))
-    if variations:
-        robot.vary(**{key: value[0] for key, value in variations.items()})
+    require_numbers(robot.plant, variations, (len(np.asarray(x0s)),))
 
     def make(values: Values) -> RobotController:
         made = _weighted(mpc, values, terminal_weight)

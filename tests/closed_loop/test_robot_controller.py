@@ -415,7 +415,7 @@ def test_bad_loops_are_named(pendulum, linear_mpc):
         ),
         (
             lambda: many(law, pendulum, x0s, 5, variations={"body_mass": np.ones((5, 3))}),
-            "body_mass: shape .3,. where .2,. is needed",
+            r"body_mass: shape \(5, 3\) where \(5, 2\) is needed",
         ),
         (lambda: many(law, quadrotor, x0s, 5), "plant: has 13 states and 4 inputs, the controller"),
         (

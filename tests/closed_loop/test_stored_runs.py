@@ -92,7 +92,11 @@ def test_wrong_arguments_leave_no_store(tmp_path, joint, feedback):
     for x0s, factors, message in (
         (np.zeros(2), None, r"x0s: shape \(2,\)"),
         (np.zeros((2, 3)), None, r"x0s: shape \(2, 3\)"),
-        (np.zeros((2, 2)), {"friction": np.ones((2, 1))}, "dof_frictionloss: is zero"),
+        (
+            np.zeros((2, 2)),
+            {"friction": np.ones((2, 1))},
+            "friction: is a factor of dof_frictionloss, which is 0",
+        ),
     ):
         with pytest.raises(ValueError, match=message):
             simulate_into(tmp_path / "runs.zarr", feedback, joint, x0s, 3, factors=factors)

@@ -673,10 +673,16 @@ def test_wrong_sizes_are_named(quadrotor, pendulum, arm2):
         (lambda: pendulum.equilibrium([np.nan]), "q: holds NaN"),
         (lambda: pendulum.inverse_dynamics([0.0], [0.0, 0], [0.0]), "velocity: shape .2,."),
         (lambda: pendulum.trajectory(zero((2, 1))), "positions: .*K ≥ 3"),
-        (lambda: pendulum.vary(body_masses=[1.0]), "body_masses: is no array of mjx.Model. Give"),
+        (
+            lambda: pendulum.vary(body_masses=[1.0]),
+            "body_masses: is no number that varies. Did you mean body_mass",
+        ),
         (lambda: pendulum.vary(body_mass=[1.0]), "body_mass: shape .1,. where .2,. is needed"),
         (lambda: pendulum.vary(body_mass=[1.0, np.nan]), "body_mass: holds NaN"),
-        (lambda: pendulum.vary(payload=1.0), "payload: pendulum has no site named tool. Add <site"),
+        (
+            lambda: pendulum.vary(payload=1.0),
+            "payload: the robot has no site named tool. Add <site",
+        ),
         (lambda: arm2.vary(payload=[1.0, 2.0]), "payload: shape .2,."),
     ):
         with pytest.raises(ValueError, match=message):

@@ -44,6 +44,35 @@ def test_what_is_wrong_in_a_urdf_is_named(tmp_path):
         jm.load_robot(path)
 
 
+def test_a_planar_joint_keeps_its_velocity_limit(tmp_path):
+    """MuJoCo makes joints of other names of it."""
+    path = Path(tmp_path / "sled.urdf")
+    path.write_text(URDF.replace("revolute", "planar").replace('lower="-1" upper="1" ', ""))
+    robot = jm.load_robot(path)
+    velocities = dict(zip(robot.state_names[3:], robot.state_limits.upper[3:], strict=True))
+    assert velocities == {
+        "hinge_TX velocity": 2, "hinge_TY velocity": 2, "hinge_RZ velocity": np.inf
+    }  # fmt: skip
+
+
+def test_bodies_moved_by_hand_stand_where_the_key_for_home_has_them():
+    """A tray under a ball: without it the ball would fall, elsewhere it would lie lower."""
+    file = """<mujoco><worldbody><body name="tray" mocap="true" pos="0 0 -1">
+    <geom type="box" size=".5 .5 .01"/></body><body pos="0 0 .3"><joint name="j" type="slide"
+    axis="0 0 1"/><geom size=".1" mass="1"/></body></worldbody>
+    <actuator><motor joint="j"/></actuator><keyframe><key name="other" qpos="0"/>
+    <key name="home" qpos="-.1" mpos=".1 0 .095" mquat="0 0 0 1"/></keyframe></mujoco>"""
+    model = mujoco.MjModel.from_xml_string(file)
+    robot, data = jm.load_robot(model), mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 1)
+    x = robot.home
+    for _ in range(3):
+        mujoco.mj_step(model, data, robot.substeps)
+        x = robot.step(x, np.zeros(1))
+    np.testing.assert_allclose(x, [data.qpos[0], data.qvel[0]], atol=1e-5)
+    assert data.qvel[0] > 1e-3  # the tray pushes it up
+
+
 @pytest.mark.parametrize("encoding", ["utf-16", "iso-8859-1", "utf-8-sig"])
 def test_a_urdf_in_the_encoding_that_it_declares(tmp_path, encoding):
     path = Path(tmp_path / "swing.urdf")
