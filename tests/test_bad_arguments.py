@@ -675,6 +675,8 @@ CALLS = [
     ("horizons: 0. Give a whole number of at", lambda: jm.feasible.feasible_growth(M, [3, 0])),
     ("horizons: 2.5. Give a whole number of at", lambda: jm.feasible.feasible_growth(M, [2.5])),
     ("mpc: is a int. Give a jm.MPC", lambda: jm.feasible.feasible_growth(3, [3])),
+    ("mpc: is a int. Give a jm.MPC", lambda: jm.recursion.smallest_horizon(3)),
+    ("run: is a int. Give a", lambda: jm.tuning.transfer_penalties(3, M)),
     ("axes: 0 is not a list. Give state", lambda: jm.map_feasible_set(M, x, axes=0)),
     ("x0s: shape (). Give points (B, 2), one", lambda: jm.map_feasible_set(M, 3)),
     ("devices: array(2). Give a whole", lambda: jm.solve_many(M, [x], devices=np.array(2))),
@@ -875,11 +877,16 @@ def test_arguments_that_do_not_exist_or_are_missing(message, call):
 
 
 @pytest.mark.parametrize(
-    ("shape", "value"),
-    [(r"\(3,\)", np.zeros(3)), (r"\(2, 1\)", np.zeros((2, 1))), (r"\(\)", None)],
+    ("found", "value"),
+    [
+        (r"shape \(3,\)", np.zeros(3)),
+        (r"shape \(2, 1\)", np.zeros((2, 1))),
+        ("a NoneType", None),
+        ("a dict", {"x": x}),
+    ],
 )
-def test_a_plant_whose_step_returns_no_state_is_named(shape, value):
-    message = rf"plant: has a step that returns shape {shape}. Return the next state \(2,\)"
+def test_a_plant_whose_step_returns_no_state_is_named(found, value):
+    message = rf"plant: has a step that returns {found}. Return the next state \(2,\)"
     with pytest.raises(ValueError, match=message):
         jm.simulate(LAW, Returns(value), x, 3)
 
@@ -1002,5 +1009,7 @@ def test_shapes_that_do_not_fit_are_told_at_construction(given, message):
     mpc = make({})
     many = jax.tree.map(lambda v: np.stack([v, v, v]), mpc)
     assert dataclasses.replace(many, system=many.system).system.B.shape == (3, 2, 1)
-    for change in (np.transpose, np.shape, np.ravel, lambda v: object(), lambda v: 0):
-        jax.tree.leaves(jax.tree.map(change, many))
+    plant = jm.LinearPlant(S, BOX, jm.Box(-1.0, 1.0))
+    for change in (np.transpose, np.shape, np.ravel, lambda v: object(), lambda v: 0, type):
+        jax.tree.leaves(jax.tree.map(change, (many, plant)))
+        jax.tree.map(lambda v: None, (many, plant))

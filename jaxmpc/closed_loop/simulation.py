@@ -385,8 +385,10 @@ class Loop:
             disturbances=disturbances,
         )
         after = self.plant.step(x, u)
-        if np.shape(after) != x.shape:
-            what = f"has a step that returns shape {np.shape(after)}"
+        shape = getattr(after, "shape", None)
+        if shape != x.shape:
+            what = f"shape {shape}" if shape is not None else f"a {type(after).__name__}"
+            what = f"has a step that returns {what}"
             fail("plant", what, f"Return the next state {x.shape}")
         after = jnp.asarray(after, x.dtype)
         if process is not None:

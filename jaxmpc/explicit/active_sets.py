@@ -452,7 +452,8 @@ def least_distance_form(
     # Rounding decides whether a singular matrix has a Cholesky factor.
     least = np.linalg.eigvalsh(unit[:, None] * curvature * unit).min(initial=1.0)
     if least <= SINGULAR:
-        if mpc:
+        if isinstance(problem, MPC):
+            problem.require_unique_inputs()  # names the weight that is missing
             what = "leaves the condensed cost singular in float64"
             fail("R", what, "Put a larger weight on inputs")
         what = "is singular in float64 where rows leave z free: the optimum is not unique"

@@ -50,6 +50,10 @@ from jaxmpc.systems.system import host_matrices
 # Bits of the numbers whose sums are computed exactly, relative to the largest of an array.
 BITS = 48
 
+# Of feasible sets of a class of policies, and what helps.
+NO_VOLUME = "is empty or flat: no initial state has a policy of this class with a margin"
+MORE_ROOM = "Relax a limit, shrink the disturbance or enlarge the terminal set"
+
 
 def problem_of(mpc: MPC, axes: Axes = None, fixed: Reals | None = None) -> FeasibilityProblem:
     """Return the feasibility problem of `mpc` for its policy; arguments as in
@@ -435,9 +439,7 @@ class PolicyPrograms:
         if not t > 1e-9:
             if given is not None:
                 fail("center", f"{given} is not inside the feasible set", "Give None or another")
-            what = "is empty or flat: no initial state has a policy of this class with a margin"
-            cure = "Relax a limit, shrink the disturbance or enlarge the terminal set"
-            fail("mpc", f"its feasible set {what}", cure)
+            fail("mpc", f"its feasible set {NO_VOLUME}", MORE_ROOM)
         x = x if given is None else np.append(given, x)
         return x[:d], x
 

@@ -10,12 +10,12 @@ import numpy as np
 from jaxmpc.checks import entries, fail, require_kind, whole
 from jaxmpc.feasible.hard_constraints import augmented_dynamics
 from jaxmpc.feasible.plan_polytope import DIMENSIONS, FACETS, CenteredPolytope, projected
-from jaxmpc.feasible.policy_problem import problem_of
+from jaxmpc.feasible.policy_problem import MORE_ROOM, NO_VOLUME, problem_of
 from jaxmpc.mpc.plan import rate_ends
-from jaxmpc.mpc.problem import HARD, MPC
+from jaxmpc.mpc.problem import HARD, MPC, RELAX
 from jaxmpc.pytrees import record
 from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope
-from jaxmpc.sets.geometry import unit_rows
+from jaxmpc.sets.geometry import Empty, unit_rows
 from jaxmpc.sets.predecessors import predecessor
 from jaxmpc.systems.system import LinearSystem
 
@@ -43,21 +43,37 @@ def feasible_polytope(mpc: MPC) -> Polytope:
     Raises ValueError where X_N is empty, flat or unbounded, for an ellipsoidal terminal set, and
     where there are too many facets. NumPy in float64; not traceable.
     """
+    return _polytope(mpc, _all_facets(mpc))
+
+
+def _polytope(mpc: MPC, body: CenteredPolytope | str) -> Polytope:
+    """Return X_N as found by `_all_facets`; ValueError with the reason why it is not."""
+    if not isinstance(body, str):
+        return body.polytope
+    cure = "Map it with map_feasible_set, which has no such limit"
+    if _has_no_volume(body) and mpc.disturbance is not None and mpc.policy != "tightened":
+        body, cure = f"its feasible set {NO_VOLUME}", MORE_ROOM
+    elif "empty" in body:
+        cure = RELAX
+    elif "flat" in body:
+        cure = "The regions of jm.explicit.critical_regions(mpc), in fewer dimensions, fill it"
+    return fail("mpc", body, cure)
+
+
+def _all_facets(mpc: MPC) -> CenteredPolytope | str:
+    """Return X_N, or the reason why its facets are not found."""
     problem = problem_of(mpc)
     plans = problem.plan_polytope
     if not plans.exact:
         fail("terminal_set", "is an Ellipsoid, so X_N has a curved boundary", "Map it and refine()")
     if plans.p <= DIMENSIONS:
-        body = projected(plans)
-    else:
-        sets = backward(problem.mpc)
-        body = sets if isinstance(sets, str) else sets[1]
-    if isinstance(body, str):
-        cure = "Map it with map_feasible_set, which has no such limit"
-        if "flat" in body:
-            cure = "The regions of jm.explicit.critical_regions(mpc), in fewer dimensions, fill it"
-        fail("mpc", body, cure)
-    return body.polytope
+        return projected(plans)
+    sets = backward(problem.mpc)
+    return sets if isinstance(sets, str) else sets[1]
+
+
+def _has_no_volume(reason: str) -> bool:
+    return "is empty" in reason or "is flat" in reason
 
 
 def any_policy_polytope(mpc: MPC) -> Polytope:
@@ -68,7 +84,8 @@ def any_policy_polytope(mpc: MPC) -> Polytope:
     state limits): exact to rounding, whatever the policy of `mpc` is, whose sets lie inside it. A
     state outside is infeasible for every policy. Where input rates are limited states are
     (x, u_{−1}). Soft rows count as none, as in labels, and inputs are free at each step, also where
-    `control_horizon` holds them. Works as far as elimination goes. Raises ValueError for other
+    `control_horizon` holds them. Where no policy does it is empty (`is_empty()`). Works as far as
+    elimination goes. Raises ValueError for other
     limits than those of states, inputs and their rates at the usual steps, an ellipsoidal terminal
     set, and as `predecessor` does.
     """
@@ -93,7 +110,7 @@ def any_policy_polytope(mpc: MPC) -> Polytope:
     body, count = (mpc.states, mpc.horizon - 1) if last is None else (last, mpc.horizon)
     sides = mpc.states, mpc.inputs, mpc.disturbance, mpc.disturbance_matrix
     for _ in range(count):
-        body = predecessor(mpc.system, body, *sides)
+        body = _step_back(mpc.system, body, *sides)
     return body if isinstance(body, Polytope) else body.to_polytope()
 
 
@@ -124,8 +141,16 @@ def _any_policy_of_rates(mpc: MPC) -> Polytope:
         if k == 0 and free:
             body = states
         else:
-            body = predecessor(system, body, states, changes, mpc.disturbance, E)
+            body = _step_back(system, body, states, changes, mpc.disturbance, E)
     return body
+
+
+def _step_back(system: LinearSystem, body: Any, *sides: Any) -> Polytope:
+    """Return the predecessor of a set, empty as that may be."""
+    try:
+        return predecessor(system, body, *sides)
+    except Empty:
+        return Polytope.empty(system.n)
 
 
 @record
@@ -133,13 +158,13 @@ class Growth:
     """Feasible sets at several horizons.
 
     horizons (H,): which. volume (H,), facets (H,): of each set, the volume and the number of
-    facets. sets: the polytopes.
+    facets, zeros where it is empty or flat. sets: the polytopes, None where there is no volume.
     """
 
     horizons: np.ndarray
     volume: np.ndarray
     facets: np.ndarray
-    sets: tuple[Polytope, ...]
+    sets: tuple[Polytope | None, ...]
 
 
 def feasible_growth(mpc: MPC, horizons: Sequence[int]) -> Growth:
@@ -147,19 +172,23 @@ def feasible_growth(mpc: MPC, horizons: Sequence[int]) -> Growth:
 
     horizons: whole numbers N ≥ 1, in place of that of `mpc`.
 
-    Raises ValueError as `feasible_polytope` does, and where steps or blocks of `mpc` fit one
-    horizon only.
+    Raises ValueError where X_N is unbounded, and as `feasible_polytope` does for an ellipsoidal
+    terminal set and too many facets, and where steps or blocks of `mpc` fit one horizon only.
     """
     require_kind("mpc", mpc, MPC)
     mpc.require_constant("it has the length of one horizon", *HARD)
     given = entries("horizons", horizons, "Give a list, such as [5, 10, 20]")
     every = [whole("horizons", N, 1) for N in given]
-    sets = tuple(feasible_polytope(replace(mpc, horizon=N)) for N in every)
+    sets = []
+    for changed in (replace(mpc, horizon=N) for N in every):
+        found = _all_facets(changed)
+        nothing = isinstance(found, str) and _has_no_volume(found)
+        sets.append(None if nothing else _polytope(changed, found))
     return Growth(
         horizons=np.array(every, int),
-        volume=np.array([body.volume() for body in sets]),
-        facets=np.array([len(np.asarray(body.h)) for body in sets]),
-        sets=sets,
+        volume=np.array([body.volume() if body else 0.0 for body in sets]),
+        facets=np.array([len(np.asarray(body.h)) if body else 0 for body in sets]),
+        sets=tuple(sets),
     )
 
 

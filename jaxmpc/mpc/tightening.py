@@ -168,9 +168,10 @@ def with_bounds(mpc: MPC, found: Sequence[Any], *, widest: bool) -> list[Any]:
     for b, (low, high), error in zip(found, sizes, errors, strict=True):
         low, high = (np.where(error > 0, v + sign * error, v) for v in (low, high))
         lower, upper = np.asarray(b.lower) + low, np.asarray(b.upper) - high
-        # Of this sum itself.
-        lower = np.where(error > 0, np.nextafter(lower, sign * np.inf), lower)
-        upper = np.where(error > 0, np.nextafter(upper, -sign * np.inf), upper)
+        # Of this sum itself; of an infinite side it would be the largest number.
+        low, high = (np.isfinite(side) & (error > 0) for side in (lower, upper))
+        lower = np.where(low, np.nextafter(lower, sign * np.inf), lower)
+        upper = np.where(high, np.nextafter(upper, -sign * np.inf), upper)
         placed.append(replace(b, lower=lower, upper=upper))
     return placed
 

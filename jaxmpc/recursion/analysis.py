@@ -313,6 +313,7 @@ def smallest_horizon(
     nor refuted is in `reasons` with holds None, and one at which the problem is ill-posed (more
     free moves than steps) is left out of it. Raises ValueError for an ill-posed problem.
     """
+    require_kind("mpc", mpc, MPC)
     mpc.validate()
     mpc.require_constant(SAME, *HARD)
     max_horizon = whole("max_horizon", max_horizon, 1)

@@ -28,8 +28,8 @@ class LinearPlant:
     name: str = static(default="linear")
 
     def __post_init__(self) -> None:
-        if not isinstance(self.system, LinearSystem):
-            return
+        if not isinstance(self.system, LinearSystem) or np.ndim(self.system.A) != 2:
+            return  # what JAX puts in place of arrays
         if self.home is None:
             object.__setattr__(self, "home", np.zeros(self.n))
         for name, size in (("state_limits", self.n), ("input_limits", self.m)):

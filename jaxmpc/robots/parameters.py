@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxmpc.checks import concrete, fail, nearest, require_finite, require_shape
+from jaxmpc.checks import concrete, fail, nearest, require_finite, require_kind, require_shape
 from jaxmpc.robots.mujoco_access import mujoco, number_of
 
 if TYPE_CHECKING:
@@ -51,6 +51,7 @@ def require_numbers(
     physics: "Physics", numbers: Mapping[str, Any], batch: tuple[int, ...] = ()
 ) -> None:
     """Raise ValueError unless a model can have these numbers, with the axes `batch` in front."""
+    require_kind("numbers", numbers, Mapping, cure='Give {"body_mass": ..., ...}')
     for key, value in numbers.items():
         if key == PAYLOAD:
             require_tool(physics.model)

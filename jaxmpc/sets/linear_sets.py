@@ -332,9 +332,10 @@ class Polytope(LinearSet):
 
         If one of the two has labels, the unlabelled rows of the other get the label "".
         """
-        other = as_polytope("other", other)
-        self._require_fields("Polytope", self.dimension)
-        other._require_fields("other", self.dimension)
+        n = self.dimension
+        other = as_polytope("other", other.spread(n) if isinstance(other, LinearSet) else other)
+        self._require_fields("Polytope", n)
+        other._require_fields("other", n)
         (H, h), (H_too, h_too) = self.half_spaces(), other.half_spaces()
         labels: tuple[str, ...] = ()
         if self.labels or other.labels:
@@ -492,8 +493,8 @@ class Polytope(LinearSet):
         self._require_fields("Polytope")
         H, h = self.half_spaces()
         if isinstance(other, ConvexSet):
-            other.validate("other", self.dimension)
             other = other.spread(self.dimension) if isinstance(other, LinearSet) else other
+            other.validate("other", self.dimension)
             support: Any = other.support
         else:
             corners = points("other", other, self.dimension)
@@ -742,8 +743,10 @@ class Box(LinearSet):
 
     def intersect(self, other: LinearSet) -> LinearSet:
         """Return the points in both sets: a Box with a Box (perhaps empty), else a Polytope."""
+        self = self.spread(other.dimension) if isinstance(other, LinearSet) else self
         if not isinstance(other, Box):
             return self.to_polytope().intersect(other)
+        other = other.spread(self.dimension)
         lower, upper = self._ends()
         other._require_fields("other", len(lower))
         lower_too, upper_too = other._ends()

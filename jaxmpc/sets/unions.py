@@ -93,6 +93,7 @@ def set_difference(minuend: LinearSet, *others: LinearSet) -> PolytopeUnion:
     pieces: Sequence[Polytope] = [as_polytope("minuend", minuend).reduce()]
     n = minuend.dimension
     for i, other in enumerate(others):
+        other = other.spread(n) if isinstance(other, LinearSet) else other
         taken = as_polytope(f"others[{i}]", other)
         taken._require_fields(f"others[{i}]", n)
         pieces = [part for piece in pieces for part in _beyond(piece, taken)]

@@ -5,6 +5,7 @@ from types import FunctionType
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
@@ -35,6 +36,11 @@ class ConstantPart:
         return hash((tree, *(v if isinstance(v, int | str) else id(v) for v in leaves)))
 
 
+def as_array_of_numbers(found: Any) -> Any:
+    """Return what a user's function gives, of a list or tuple of numbers an array."""
+    return jnp.asarray(found) if isinstance(found, list | tuple) else found
+
+
 def _same(a: Any, b: Any) -> bool:
     return a is b or (type(a) is type(b) and isinstance(a, int | str) and a == b)
 
@@ -63,11 +69,11 @@ class GivenModel:
     def step(self, x: Array, u: Array) -> Array:
         """Return x⁺."""
         given = self.given
-        return getattr(given, "step", given)(x, u)
+        return as_array_of_numbers(getattr(given, "step", given)(x, u))
 
     def __call__(self, *values: Any) -> Any:
         """Return what the function gives."""
-        return self.given(*values)
+        return as_array_of_numbers(self.given(*values))
 
     def __repr__(self) -> str:
         return short_value(self.given)
@@ -87,7 +93,7 @@ class ClosedFunction:
 
     def __call__(self, *values: Any) -> Any:
         """Return what the function gives."""
-        return self.function(*values, *self.numbers)
+        return as_array_of_numbers(self.function(*values, *self.numbers))
 
     step = __call__
 

@@ -463,6 +463,8 @@ def transfer_penalties(run: TuningRun, mpc: MPC, iterations: int | None = None) 
     not guaranteed; its status tells. Where nothing better was found the given solver is returned.
     Raises ValueError for a problem with other blocks.
     """
+    require_kind("run", run, TuningRun)
+    require_kind("mpc", mpc, MPC)
     mpc.validate()
     solver, settings = run.solver, run.settings
     rho = np.asarray(solver.rho)

@@ -408,6 +408,18 @@ BAD = {
         lambda p: solve_nonlinear(replace(p, model=lambda x, u: jnp.zeros(3)), START),
         r"model.step\(x, u\): shape \(3,\)",
     ),
+    "no state": (
+        lambda p: solve_nonlinear(replace(p, model=lambda x, u: None), START),
+        r"model.step\(x, u\): gives a NoneType. Give the next state",
+    ),
+    "no value": (
+        lambda p: solve_nonlinear(replace(p, tasks=(Task(lambda at: None, weight=1.0),)), START),
+        "task.function: gives a NoneType. Give a vector",
+    ),
+    "half stages": (
+        lambda p: solve_nonlinear(replace(p, tasks=(replace(p.tasks[0], stages=[0.5]),)), START),
+        r"disc.stages: \(0.5,\)",
+    ),
     "no weight": (
         lambda p: solve_nonlinear(replace(p, tasks=(Task(squared, target=2.0),)), START),
         "task.target: is given without a weight",
@@ -426,6 +438,21 @@ def test_bad_arguments(name, x64):
     call, text = BAD[name]
     with pytest.raises(ValueError, match=text):
         call(around())
+
+
+def test_what_has_one_meaning_is_taken(x64):
+    """Models and tasks that give lists and tuples; stages as a number, a range or an array."""
+    problem = around(steps=3)
+    lists = lambda kind: replace(
+        problem,
+        model=lambda x, u: kind(problem.model.step(x, u)),
+        tasks=(replace(problem.tasks[0], function=lambda at: kind([squared(at)])),),
+    )
+    inputs = [solve_nonlinear(p, START, iterations=2).inputs for p in (problem, lists(list))]
+    np.testing.assert_allclose(*inputs, atol=1e-12)
+    lists(tuple).validate()
+    for given, stages in ((2, (2,)), (range(2), (0, 1)), (np.arange(1, 3), (1, 2)), ([3], (3,))):
+        assert replace(problem.tasks[0], stages=given).stages == stages
 
 
 class Distance:

@@ -15,6 +15,7 @@ from polytopes import assert_same_points, cube, unimodular
 from scipy.optimize import linprog
 
 from jaxmpc import Box, Polytope
+from jaxmpc.sets import set_difference
 from jaxmpc.sets.convex_sets import Ellipsoid
 from jaxmpc.sets.geometry import irredundant as _irredundant
 
@@ -123,6 +124,12 @@ def test_intersect():
     assert shifted.reduce().H.shape == (4, 2)
     diamond = Polytope(np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]]), 1.5 * np.ones(4))
     assert square.intersect(diamond).volume() == pytest.approx(4 - 4 * 0.125, abs=1e-13)
+    interval = Box(-0.5, 0.5)  # of each coordinate
+    for whole in (square, Box([-1, -1], [1, 1])):
+        for both in (whole & interval, interval & whole):
+            assert both.volume() == pytest.approx(1, abs=1e-14)
+    assert set_difference(square, interval).volume() == pytest.approx(3, abs=1e-13)
+    assert (square - interval).volume() == pytest.approx(1, abs=1e-14)
     with pytest.raises(ValueError, match="other: has dimension 3 where 2"):
         square.intersect(cube(3))
     with pytest.raises(ValueError, match="other: list"):

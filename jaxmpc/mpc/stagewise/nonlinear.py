@@ -73,6 +73,9 @@ class Task:
     def __post_init__(self) -> None:
         if callable(self.function):
             object.__setattr__(self, "function", as_argument(self.function))
+        if self.stages is not None and not isinstance(self.stages, tuple):
+            stages = tuple(np.atleast_1d(np.asarray(self.stages)).tolist())
+            object.__setattr__(self, "stages", stages)
 
     @property
     def limited(self) -> bool:
@@ -219,7 +222,11 @@ class NonlinearMPC:
 
     def value(self, task: Task, x: Array, u: Array) -> Array:
         """Return what the task's function gives at x, u, as a vector."""
-        return jnp.atleast_1d(jnp.asarray(task.function(self.view(x, u)))).astype(x.dtype)
+        found = task.function(self.view(x, u))
+        if not hasattr(found, "dtype") and not isinstance(found, int | float):
+            what = f"gives a {type(found).__name__}"
+            fail(f"{task.name}.function", what, "Give a vector of numbers")
+        return jnp.atleast_1d(jnp.asarray(found)).astype(x.dtype)
 
     def view(self, x: Array, u: Array) -> Any:
         """Return what tasks are functions of."""
@@ -281,6 +288,9 @@ def _shapes(tree: Any, leaves: tuple) -> tuple[tuple[int, ...], list[tuple[int, 
         what = f"is not written in JAX ({str(error).splitlines()[0]})"
         cure = "Use jax.numpy in place of numpy, and jnp.where or jax.lax.cond in place of if"
         fail("model or task", what, cure)
+    if not hasattr(after, "shape"):
+        cure = f"Give the next state ({system.n},), an array of jax.numpy"
+        fail("model.step(x, u)", f"gives a {type(after).__name__}", cure)
     return after.shape, [value.shape for value in values], (x, u, view)
 
 

@@ -1,0 +1,65 @@
+"""Empty, flat and unbounded feasible sets under each policy: what is said of them, and whether the
+cure that an error gives is one."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import jaxmpc as jm
+from jaxmpc.feasible import any_policy_polytope, feasible_growth, feasible_polytope
+
+MPC = jm.MPC(
+    system=jm.LinearSystem([[1, 0.2], [0, 1]], [[0.02], [0.2]]),
+    Q=np.eye(2),
+    R=0.1,
+    horizon=3,
+    states=jm.Box([-1.0, -1.0], [1.0, 1.0]),
+    inputs=jm.Box(-1.0, 1.0),
+)
+NOISE = {"disturbance": jm.Box(-0.01, 0.01)}
+GAIN = {**NOISE, "gain": [[-2.0, -2.5]]}
+POLICIES = {
+    "nominal": {},
+    "tightened": GAIN,
+    "affine": {**NOISE, "policy": "affine"},
+    "tube": {**GAIN, "policy": "tube"},
+}
+FAR = {"terminal_set": jm.Box([5.0, 5.0], [6.0, 6.0])}
+OPEN = {"states": jm.Box([-np.inf, -1.0], [np.inf, 1.0])}
+
+
+@pytest.mark.parametrize("policy", POLICIES)
+def test_cures_of_a_feasible_set_without_facets(policy):
+    given = replace(MPC, **POLICIES[policy])
+    empty, unbounded = replace(given, **FAR), replace(given, **OPEN)
+    with pytest.raises(ValueError, match=r"set is empty.* (Relax a limit)"):
+        feasible_polytope(empty)
+    assert feasible_polytope(given).volume() > 1  # the cure
+    with pytest.raises(ValueError, match="unbounded. Map it with map_feasible_set"):
+        feasible_polytope(unbounded)
+    fmap = jm.map_feasible_set(unbounded, [[0.0, 0.0], [0.0, 2.0]])
+    np.testing.assert_array_equal(fmap.label, [1, -1])
+    assert any_policy_polytope(empty).is_empty()
+    assert not any_policy_polytope(given).is_empty()
+
+
+def test_flat_feasible_sets():
+    flat = replace(MPC, horizon=1, terminal_set=jm.Box([0.0, 0.0], [0.0, 0.0]))
+    with pytest.raises(ValueError, match="flat.*jm.explicit.critical_regions.mpc."):
+        feasible_polytope(flat)
+    assert len(jm.explicit.critical_regions(flat).regions)
+    growth = feasible_growth(flat, [1, 2])
+    assert growth.volume[0] == growth.facets[0] == 0 and growth.sets[0] is None
+    np.testing.assert_allclose(
+        growth.volume[1], feasible_polytope(replace(flat, horizon=2)).volume()
+    )
+    one_way = {"disturbance": jm.Box([-0.01], [0.01]), "disturbance_matrix": [[1.0], [0.0]]}
+    still = jm.LinearSystem(np.eye(2), np.eye(2))
+    sides = jm.Box([-1.0, 0.0], [1.0, 0.0])
+    robust = replace(
+        MPC, system=still, R=np.eye(2), policy="affine", states=sides, inputs=sides, **one_way
+    )
+    with pytest.raises(ValueError, match="empty or flat.*Relax a limit"):
+        feasible_polytope(robust)
+    assert feasible_growth(robust, [2]).volume[0] == 0
