@@ -106,5 +106,8 @@ _SENTENCES = {
         "The Hessian of the cost has a negative eigenvalue beyond rounding. "
         "Make the weights positive semidefinite: check their signs."
     ),
-    Status.NON_FINITE: "The data of this instance hold NaN, or l > u, or an infinite weight.",
+    Status.NON_FINITE: (
+        "The data of this instance hold NaN, or l > u, or an infinite weight, or they overflow in "
+        "their precision: compute in float64, or give an unstable prediction fewer steps."
+    ),
 }

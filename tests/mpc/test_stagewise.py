@@ -518,6 +518,17 @@ def test_a_state_far_off_is_solved_within_limits_or_not(one, x64):
     np.testing.assert_allclose(of_all, of_two, rtol=1e-9 if x64 else 1e-5)
 
 
+@pytest.mark.parametrize("steps", [{}, {"newton_steps": 0}, {"iterations": 20}])
+def test_a_prediction_that_overflows_is_no_matter_of_more_steps(steps, x64):
+    """As `solve` says of it."""
+    mpc = jm.MPC(
+        jm.LinearSystem([[1e100]], [1.0]), 1.0, 0.1, 6, jm.Box(-1.0, 1.0), jm.Box(-1.0, 1.0)
+    )
+    plans = [solve_stagewise(mpc, [0.5], solver=jm.ADMM(**steps)), jm.solve(mpc, [0.5])]
+    for plan in plans:
+        assert plan.status == jm.Status.NON_FINITE and "overflow" in plan.sentence
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("cost", [0.1, 1e-6])
 def test_held_inputs_do_not_move(cost):

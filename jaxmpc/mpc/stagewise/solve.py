@@ -202,10 +202,10 @@ def _factor(mpc: MPC, rho: Any, scale: Any, steps: bool) -> StageFactor:
     rho = default_rho(E, inputs) if rho is None else jnp.asarray(rho, E.dtype)
     rho = jnp.broadcast_to(rho, (rho.shape[0] if rho.ndim == 2 else 1, E.shape[0]))
     gains = jax.lax.map(lambda rho: riccati(s, rho * E**2), rho) if steps else None
-    # Finite data can still overflow, or be too near singular for their precision.
+    # Finite data can still overflow.
     sound = all_finite((E, gains, s.gain))
     E, gains, gain = jax.tree.map(lambda v: jnp.where(sound, v, 0.0), (E, gains, s.gain))
-    fault = jnp.where(sound, fault, jnp.int32(Status.ITERATION_LIMIT))
+    fault = jnp.where(sound, fault, jnp.int32(Status.NON_FINITE))
     return StageFactor(replace(s, gain=gain), E, rho, gains, fault)
 
 
