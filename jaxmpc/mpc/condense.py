@@ -250,7 +250,8 @@ def condense(mpc: MPC) -> Condensed:
     if mpc.disturbance is not None and concrete(mpc):
         require_room(mpc, blocks(mpc, float))
     if concrete(mpc):
-        return on_device(_condense(host_arrays(mpc)))
+        with np.errstate(over="ignore", invalid="ignore"):  # the status tells
+            return on_device(_condense(host_arrays(mpc)))
     return _condense_in_jax(arrays(mpc))
 
 
