@@ -716,7 +716,6 @@ CALLS = [
     ),
     ("pieces: 3 is not a list. Give a tuple", lambda: jm.sets.PolytopeUnion(3)),
     ("n: [2]. Give a whole number of at least", lambda: jm.Polytope.empty([2])),
-    ("box: is a int. Give a jm.Box", lambda: jm.sets.Zonotope.from_box(3)),
     ("count: [3]. Give a whole number of at", lambda: jm.Ellipsoid(np.eye(2), 1).boundary([3])),
     ("axes: 1.5 is not a list. Name those", lambda: BOX.project(1.5)),
     ("seconds: (). Give a time limit in", lambda: jm.explicit.critical_regions(M, seconds=())),

@@ -26,7 +26,6 @@ from jaxmpc.checks import (
     fail,
     number,
     require_finite,
-    require_kind,
     require_names,
     require_real,
     whole,
@@ -930,12 +929,6 @@ class Zonotope(LinearSet):
     def __post_init__(self) -> None:
         store_floats(self, "center", "generators")
         self._require_given(center=1, generators=2)
-
-    @classmethod
-    def from_box(cls, box: Box) -> "Zonotope":
-        """Return a bounded box as a zonotope, one generator a coordinate of positive width."""
-        require_kind("box", box, Box)
-        return box.to_zonotope()
 
     @property
     def dimension(self) -> int:

@@ -179,7 +179,7 @@ def sum_of_disturbances(
 ) -> Zonotope:
     """Return ⊕_{i<steps} closed^i (E W ⊕ {|x| ≤ spread}), what so many disturbances can add up to,
     of a Box or Zonotope W. Raises ValueError for other sets."""
-    W = Zonotope.from_box(W) if isinstance(W, Box) else W
+    W = W.to_zonotope() if isinstance(W, Box) else W
     if not isinstance(W, Zonotope):
         what = "is no Box or Zonotope, whose sums alone have generators"
         fail("disturbance", what, "Give a Box or a Zonotope, or use the supports of the sum")
@@ -221,7 +221,7 @@ def _normals(E: np.ndarray, W: Any) -> np.ndarray | None:
     if isinstance(W, Box) and np.array_equal(E, np.eye(n)):
         normals = np.vstack([np.eye(n), -np.eye(n)])
         return normals if np.all(supports(W, normals) > 0) else None
-    W = Zonotope.from_box(W) if isinstance(W, Box) else W
+    W = W.to_zonotope() if isinstance(W, Box) else W
     try:
         body = W.image(E)
         if isinstance(body, Zonotope):

@@ -121,7 +121,7 @@ def test_slow_loops_and_bad_arguments():
 def test_maximal_sets_take_the_matrix_of_disturbances():
     """E W as a polytope of its own gives the same sets."""
     E, W = np.array([[0.5, 0.1], [1.0, 0.0]]), jm.Box([-0.1, -0.2], [0.1, 0.2])
-    EW = jm.sets.Zonotope.from_box(W).image(E).to_polytope()
+    EW = W.to_zonotope().image(E).to_polytope()
     X, U, K = jm.Box([-5.0, -2.0], [5.0, 2.0]), jm.Box(-1.0, 1.0), jm.lqr(DOUBLE, np.eye(2), 0.1).K
     one = jm.maximal_invariant_set(DOUBLE, K, X, U, disturbance=W, disturbance_matrix=E)
     two = jm.maximal_invariant_set(DOUBLE, K, X, U, disturbance=EW)

@@ -51,7 +51,7 @@ def polytope(intervals, unit):
 
 
 def zonotope(intervals, unit):
-    return Zonotope.from_box(box(intervals, unit))
+    return box(intervals, unit).to_zonotope()
 
 
 KINDS = {"Box": box, "Polytope": polytope, "Zonotope": zonotope}

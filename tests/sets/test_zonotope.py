@@ -21,7 +21,7 @@ def all_signs(zonotope):
 def test_the_vertices_of_rakovic_2005():
     """F_4 of example 1 in Raković, Kerrigan, Kouramas & Mayne 2005: 16 vertices, exact decimals."""
     closed = np.array([[-0.17, -0.03], [-1.17, -0.03]])
-    total = Zonotope.from_box(Box([-1, -1], [1, 1]))
+    total = Box([-1, -1], [1, 1]).to_zonotope()
     power = np.eye(2)
     for _ in range(3):
         power = closed @ power
@@ -76,7 +76,7 @@ def test_sums_images_and_projections():
     np.testing.assert_allclose(shadow.support(d3[:, [2, 0]]), Z.support(d3 * [1, 0, 1]), rtol=1e-12)
     box = Z.bounding_box()
     np.testing.assert_allclose(box.upper, Z.support(np.eye(3)), rtol=1e-14)
-    wide = Zonotope.from_box(W).minkowski_sum(Polytope.from_points(np.eye(4, 3)))
+    wide = W.to_zonotope().minkowski_sum(Polytope.from_points(np.eye(4, 3)))
     assert isinstance(wide, Polytope) and wide.support([1, 1, 1]) == pytest.approx(6.5)
 
 
@@ -90,7 +90,7 @@ def test_flat_ones_and_points():
     point = Zonotope([1, 2], np.zeros((2, 0)))
     assert_same_points(point.vertices(), [[1, 2]])
     assert point.volume() == 0 and point.contains([1, 2]) and not point.contains([1, 2.1])
-    assert Zonotope.from_box(Box([0, 1], [0, 2])).generators.shape == (2, 1)
+    assert Box([0, 1], [0, 2]).to_zonotope().generators.shape == (2, 1)
 
 
 def test_a_tube_of_twelve_states_and_jax():
