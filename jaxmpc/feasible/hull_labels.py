@@ -28,7 +28,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial import QhullError
 
 from jaxmpc.batches import Compiled, Devices, over_devices
 from jaxmpc.feasible import proofs
@@ -38,6 +38,7 @@ from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.rays import closed_bounds, filled
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.jax_transformations import default_platform, own_modes
+from jaxmpc.sets.geometry import convex_hull
 
 # Coordinates up to which the polytopes have few facets.
 MOST_COORDINATES = 4
@@ -168,7 +169,8 @@ def hull_facets(points: np.ndarray) -> np.ndarray:
     """Return the indices (F, d) of the vertices of each facet of the hull of points (K, d)."""
     if points.shape[1] == 1:
         return np.array([[np.argmin(points)], [np.argmax(points)]])
-    return ConvexHull(points).simplices
+    hull, kept = convex_hull(points)
+    return kept[hull.simplices]
 
 
 def vertex_values(

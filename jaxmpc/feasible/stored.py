@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial import QhullError
 
 from jaxmpc.arrays import Reals
 from jaxmpc.batches import CHUNK, Part, Timing, default_chunk, work_off
@@ -45,6 +45,7 @@ from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import record
 from jaxmpc.qp.status import Status
 from jaxmpc.sets.convex_sets import Box, Polytope
+from jaxmpc.sets.geometry import convex_hull
 from jaxmpc.sets.lp import power_of_two
 from jaxmpc.store import (
     BlockWriter,
@@ -489,7 +490,8 @@ def extreme(points: np.ndarray) -> np.ndarray:
     if d > REDUCED or not size.all():
         return points
     try:
-        return points[np.sort(ConvexHull((points - points.mean(axis=0)) / size).vertices)]
+        hull, kept = convex_hull((points - points.mean(axis=0)) / size)
+        return points[np.sort(kept[hull.vertices])]
     except QhullError:
         return points
 

@@ -7,7 +7,7 @@ hull of all of them and 0 (Ziegler 1995, section 2.3), and the polar of a projec
 """
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
@@ -27,6 +27,9 @@ from jaxmpc.sets.lp import (
 )
 
 _ZERO = 1e-12  # a coefficient that moves a row by less, relative to its distance, counts as 0
+# Errors of qhull that say: the points lie in a hyperplane, or are too few.
+_FLAT = ("QH6013", "QH6154", "QH6214")
+_ORDERS = 8  # of points, in which a hull is tried
 _MERGE = "C-1e-12"  # qhull's option: merge facets of the dual that are flat to 1e-12
 _HULL_DIMENSIONS = 6  # above, hulls have too many facets and one LP a row is faster
 _MOST_ROWS = 100_000  # an elimination step with more candidate rows raises ValueError
@@ -311,12 +314,34 @@ def hull_volume(points: Reals, *, thin: bool = False) -> float:
     # Clusters confuse qhull; one point of each spans a hull that is no larger.
     scaled = scaled if thin else scaled[distinct(scaled, 1e-11)]
     try:
-        hull = scipy.spatial.ConvexHull(scaled)
+        hull, _ = convex_hull(scaled)
     except scipy.spatial.QhullError:  # flat
         if not thin:
             return 0.0
         hull = scipy.spatial.ConvexHull(scaled, qhull_options="QJ")
     return float(hull.volume * np.prod(scale))
+
+
+def convex_hull(points: np.ndarray) -> "tuple[scipy.spatial.ConvexHull, np.ndarray]":
+    """Return the hull of points (k, n) of like size in all coordinates, n ≥ 2, and the indices of
+    those that it was computed of. QhullError where they lie in a hyperplane.
+
+    Where many points lie on one facet, as ends of rays do, qhull can lose itself among them. It is
+    then asked for the vertices alone, facets merged that are flat to 1e-9, in several orders of the
+    points, and for their hull. Where that fails too the answer is good to some 1e-9 ("Q12").
+    """
+    try:
+        return scipy.spatial.ConvexHull(points), np.arange(len(points))
+    except scipy.spatial.QhullError as error:
+        if str(error).startswith(_FLAT):
+            raise
+    for seed in range(_ORDERS):
+        kept = np.random.default_rng(seed).permutation(len(points))
+        with suppress(scipy.spatial.QhullError):
+            merged = scipy.spatial.ConvexHull(points[kept], qhull_options="C-1e-9")
+            kept = np.sort(kept[merged.vertices])
+            return scipy.spatial.ConvexHull(points[kept]), kept
+    return scipy.spatial.ConvexHull(points, qhull_options="Qt Q12"), np.arange(len(points))
 
 
 def dual_hull(Y: np.ndarray) -> "scipy.spatial.HalfspaceIntersection":

@@ -10,6 +10,7 @@ from jaxmpc.sets.geometry import (
     Empty,
     Flat,
     affine_hull,
+    convex_hull,
     distinct,
     explained,
     framed,
@@ -150,7 +151,7 @@ def _full_hull(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return np.array([[1.0], [-1.0]]), np.array([points.max(), -points.min()])
     # qhull's facets are simplices: a facet with more corners comes several times.
     with explained("points"):
-        facets = scipy.spatial.ConvexHull(points).equations
+        facets = convex_hull(points)[0].equations
     facets = facets[distinct(facets, 1e-10)]
     return facets[:, :-1], -facets[:, -1]
 

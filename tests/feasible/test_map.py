@@ -238,7 +238,7 @@ def test_proofs_are_copied_when_asked_for(points, fmap):
     np.testing.assert_array_equal(np.isfinite(labels.cut_normal).all(axis=1), outside)
     beyond = np.sum(labels.cut_normal * points, axis=1) - labels.cut_offset
     assert np.all(beyond[outside] > 0)
-    assert np.array_equal(labels.first(5).plan, labels.plan[:5], equal_nan=True)
+    assert np.array_equal(labels.rows(slice(5)).plan, labels.plan[:5], equal_nan=True)
 
 
 class TestMapObject:
