@@ -152,6 +152,11 @@ def whole(argument: str, value: Any, least: int) -> int:
     return int(value)
 
 
+def generator(seed: Any) -> np.random.Generator:
+    """Return NumPy's random numbers for a seed; raise unless it is a whole number of at least 0."""
+    return np.random.default_rng(whole("seed", seed, 0))
+
+
 def entries(argument: str, values: Any, cure: str) -> list[Any]:
     """Return the entries of a list, tuple or array; raise for a number, a text, and what has no
     order."""

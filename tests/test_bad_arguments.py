@@ -676,6 +676,13 @@ CALLS = [
     ("horizons: 2.5. Give a whole number of at", lambda: jm.feasible.feasible_growth(M, [2.5])),
     ("mpc: is a int. Give a jm.MPC", lambda: jm.feasible.feasible_growth(3, [3])),
     ("mpc: is a int. Give a jm.MPC", lambda: jm.recursion.smallest_horizon(3)),
+    ("seed: 1.5. Give a whole number of at", lambda: BOX.sample(2, seed=1.5)),
+    ("seed: True. Give a whole number of at", lambda: BOX.to_polytope().sample(2, seed=True)),
+    ("seed: -1. Give a whole number of at", lambda: BOX.to_zonotope().sample(2, seed=-1)),
+    (
+        "seed: 'a'. Give a whole number of at",
+        lambda: jm.Ellipsoid(np.eye(2), 1).sample(2, seed="a"),
+    ),
     ("run: is a int. Give a", lambda: jm.tuning.transfer_penalties(3, M)),
     ("axes: 0 is not a list. Give state", lambda: jm.map_feasible_set(M, x, axes=0)),
     ("x0s: shape (). Give points (B, 2), one", lambda: jm.map_feasible_set(M, 3)),

@@ -8,7 +8,7 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.arrays import Reals, as_array, host_array
-from jaxmpc.checks import fail, whole
+from jaxmpc.checks import fail, generator, whole
 from jaxmpc.closed_loop.simulation import simulate
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.sets.disturbances import disturbance_columns
@@ -29,7 +29,7 @@ def draw_disturbances(
     steps, count = whole("steps", steps, 1), whole("count", count, 1)
     if kind not in KINDS:
         fail("kind", f"{kind!r}", f"Give one of {', '.join(map(repr, KINDS))}")
-    rng, corners = np.random.default_rng(seed), W.vertices()
+    rng, corners = generator(seed), W.vertices()
     if kind == "vertices":
         return corners[rng.integers(len(corners), size=(count, steps))] @ E.T
     weights = rng.dirichlet(np.ones(len(corners)), (count, steps))
@@ -65,7 +65,7 @@ def worst_disturbance(
         return jnp.max(jax.vmap(lambda x: _signed(limits, x))(run.states[1:]))
 
     rise = jax.jit(jax.vmap(jax.value_and_grad(beyond)))
-    rng, starts = np.random.default_rng(seed), np.atleast_2d(host_array("x0", x0))
+    rng, starts = generator(seed), np.atleast_2d(host_array("x0", x0))
     w = corners[rng.integers(len(corners), size=(len(starts), steps))]
     best, top = w, np.full(len(starts), -np.inf)
     for _ in range(rounds):

@@ -440,6 +440,9 @@ def _prepared(given: RobotController, solver: ADMM) -> dict[str, Any]:
     if sizes != (robot.n, robot.m):
         needed = f"{(robot.n, robot.m)}: robot_mpc makes such a problem"
         fail("mpc", f"has {sizes} states and inputs", f"This robot has {needed}")
+    if mpc.system.dt is not None and not np.isclose(mpc.system.dt, robot.dt, rtol=1e-9, atol=0):
+        cure = f"Give robot_mpc a robot loaded with control_period={mpc.system.dt:g}, or this one"
+        fail("mpc", f"has dt = {mpc.system.dt:g}, the robot a period of {robot.dt:g}", cure)
     whole("sqp_steps", given.sqp_steps, 1)
     if given.hessian not in ("exact", "gauss-newton"):
         fail("hessian", f"{given.hessian!r}", 'Give "exact" or "gauss-newton"')

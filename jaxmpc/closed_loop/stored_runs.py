@@ -128,7 +128,12 @@ class _Loops:
         aims = (self.target["reference"], self.target["input_reference"])
         data = jax.tree.leaves((self.controller, aims, self.factors))
         data_hash = fingerprint(_constants(self.controller), data)
-        return {"steps": self.steps, "model": model_hash(self.robot), "data": data_hash}
+        robot = self.robot
+        plant = fingerprint(
+            repr(sorted(robot.numbers)), [robot.dt, *jax.tree.leaves(robot.numbers)]
+        )
+        model = model_hash(robot)
+        return {"steps": self.steps, "model": model, "plant": plant, "data": data_hash}
 
     def fields(self) -> "dict[str, Field]":
         """Return what the store holds of each robot."""

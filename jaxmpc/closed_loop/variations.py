@@ -70,6 +70,7 @@ def draw_robots(
     1 − this to 1 + this; payload: masses in kg are from 0 to this. The dictionary has those that
     are not zero: "mass" (count, bodies), "damping" (count, nv), "payload" (count,).
     """
+    whole("seed", seed, 0)
     starts = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0,)))
     home, below, above = start_room(robot)
     aside = spread * starts.uniform(-1, 1, (count, robot.n))
@@ -118,17 +119,22 @@ def plant_numbers(robot: Robot, factors: Mapping[str, np.ndarray]) -> dict[str, 
         if field is None:
             found[quantity] = factor
             continue
-        value = np.asarray(getattr(robot.mujoco, field))
+        value = _number(robot, field)
         _require_there(robot, quantity, field, np.arange(len(value)))
         found[field] = factor.reshape(*factor.shape, *(1,) * (value.ndim - 1)) * value
         if quantity == "mass":
-            found["body_inertia"] = factor[..., None] * robot.mujoco.body_inertia
+            found["body_inertia"] = factor[..., None] * _number(robot, "body_inertia")
     return found
+
+
+def _number(robot: Robot, field: str) -> np.ndarray:
+    """Return a number of the plant: of the file, unless it was varied."""
+    return np.asarray(robot.numbers.get(field, getattr(robot.mujoco, field)))
 
 
 def _require_there(robot: Robot, name: str, field: str, places: np.ndarray) -> None:
     """Raise ValueError for a factor of numbers that are all zero."""
-    if not np.any(np.asarray(getattr(robot.mujoco, field))[places]):
+    if not np.any(_number(robot, field)[places]):
         cure = f"Set {field} in the file, or leave it out"
         fail(name, f"is a factor of {field}, which is 0 in {robot.name}", cure)
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxmpc.arrays import Reals, host_array
-from jaxmpc.checks import fail, number, require_finite, require_kind, whole
+from jaxmpc.checks import fail, generator, number, require_finite, require_kind, whole
 from jaxmpc.explicit.active_sets import (
     SMALLEST,
     ActivePiece,
@@ -156,7 +156,7 @@ def exact_penalty(
         i = int(np.argmax(p.window.cut.any(axis=0)))
         fail("mpc", f"its feasible set is unbounded along coordinate {i}", "Give within=jm.Box(…)")
     weigh = Thresholds(p, softened(p, table))
-    search = PenaltySearch(p, weigh, np.random.default_rng(seed), deadline)
+    search = PenaltySearch(p, weigh, generator(seed), deadline)
     regions: CriticalRegions | None = None
     if method == "regions" or (method == "auto" and len(p.center) <= ENUMERATED):
         explored = explore(p, max_regions, deadline)

@@ -145,7 +145,8 @@ class FeasibleSamples:
             name: (("sample", *axes.get(name, ())), value)
             for name, value in self.arrays(plans).items()
         }
-        return xr.Dataset(data, coords={"state": list(self.mpc.labels)})
+        # (Labels name previous inputs too where those have a weight alone.)
+        return xr.Dataset(data, coords={"state": list(self.mpc.labels)[: self.x0s.shape[1]]})
 
 
 def sample_feasible_set(

@@ -310,9 +310,9 @@ def settle_by_regions(claims: Claims, max_regions: int, deadline: float = np.inf
         parts.append(region.vertices)
         if found.complete and beyond.max() > CLEAR:
             H, h = np.asarray(region.polytope.H), np.asarray(region.polytope.h)
-            stays = Polytope(
-                np.vstack([H, body.normals @ E]), np.append(h, room - body.normals @ e)
-            )
+            # A law often leads exactly onto a facet, which rounding must not take for beyond it.
+            inside = room - body.normals @ e + CLEAR * body.depths
+            stays = Polytope(np.vstack([H, body.normals @ E]), np.append(h, inside))
             lost += region.volume - _volume(stays)
     values, states = np.array(violation[1:]), np.concatenate(parts)
     top, lost = values.max(initial=-np.inf), lost if found.complete else np.nan

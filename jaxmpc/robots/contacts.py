@@ -40,7 +40,8 @@ from jaxmpc.robots.configurations import normalised, retract
 from jaxmpc.robots.description import RobotDescription
 from jaxmpc.robots.force_limits import ForceLimits
 from jaxmpc.robots.mujoco_access import equalities, mujoco, names, number_of
-from jaxmpc.robots.physics import RK4, Physics
+from jaxmpc.robots.parameters import require_numbers
+from jaxmpc.robots.physics import RK4, Physics, in_force
 
 # Distances (m) of feet from the ground up to which they are looked for, and up to which they touch.
 _NEAR, _TOUCHING = 0.05, 0.005
@@ -202,9 +203,14 @@ class StandingPhysics(Physics):
     def contact_forces(self, x: Array, u: Array, numbers: dict[str, Array] | None = None) -> Array:
         """Return the contact forces λ (3k,), normal and two tangential ones of each foot (N), at
         x = (qpos, qvel, act) under u. numbers: as in `step`."""
+        numbers = numbers or {}
+        require_numbers(self, numbers)
+        physics: Any = self.acting(numbers)
+        if physics is not self:
+            return physics.contact_forces(x, u, numbers)
         x, u = jnp.asarray(x), jnp.asarray(u)
         q, v, act = jnp.split(x, [self.model.nq, self.model.nq + self.model.nv])
-        return self._standing(numbers or {}, normalised(self.joints, q), v, act, u)[1]
+        return self._standing(in_force(numbers), normalised(self.joints, q), v, act, u)[1]
 
     def _standing(
         self, numbers: dict[str, Array], q: Array, v: Array, act: Array, u: Array

@@ -338,6 +338,10 @@ def _home(host: "mujoco.MjModel", home: Reals | None) -> tuple[np.ndarray, np.nd
     if host.nkey:
         q, act = host.key_qpos[key].copy(), host.key_act[key].copy()
         source = f"file, key {names(host, 'key')[key] or key}"
+        if home is None and not np.all(np.isfinite(np.append(q, act))):
+            fail(
+                "model", f"its {source.removeprefix('file, ')} holds NaN", "Give home=, or mend it"
+            )
     else:
         ranged = host.jnt_limited.astype(bool) & single_joints(host)
         at = host.jnt_qposadr[ranged]
@@ -798,6 +802,8 @@ def _mended(root: ElementTree.Element) -> tuple[str, ...]:
     links = {link.get("name"): link for link in root.findall("link")}
 
     def weight(name: str | None) -> float:
+        if name not in links:  # MuJoCo will say so
+            return 1.0
         fixed = (child for kind, parent, child in ends if kind == "fixed" and parent == name)
         return _mass(links[name]) + sum(map(weight, fixed))
 

@@ -34,6 +34,18 @@ FIELDS = (
     *("tendon_frictionloss", "tendon_solref_fri", "tendon_solimp_fri", "tendon_actfrcrange"),
     *("eq_data", "eq_solref", "eq_solimp"),
 )
+# Of these the model that is planned with knows nothing: it has no contacts, stops, dry friction and
+# limits of forces, and the functions of `tasks.py` have the sizes of the file.
+OF_PLANTS = (
+    *("dof_frictionloss", "dof_solref", "dof_solimp"),
+    *("tendon_frictionloss", "tendon_solref_fri", "tendon_solimp_fri"),
+    *("jnt_range", "jnt_margin", "jnt_solref", "jnt_solimp", "jnt_actfrcrange"),
+    *("tendon_range", "tendon_margin", "tendon_solref_lim", "tendon_solimp_lim"),
+    *("geom_size", "geom_friction", "geom_margin", "geom_solmix", "geom_solref", "geom_solimp"),
+    *("actuator_forcerange", "tendon_actfrcrange"),
+)
+# Given in any length, they have length one.
+DIRECTIONS = ("body_quat", "body_iquat", "geom_quat", "site_quat", "jnt_axis")
 NONNEGATIVE = (
     *("body_mass", "body_inertia", "dof_armature", "tendon_armature", PAYLOAD),
     *("dof_frictionloss", "tendon_frictionloss"),
@@ -58,6 +70,9 @@ def require_numbers(
         elif key not in (*FIELDS, *physics.own):
             cure = f"{nearest(key, (*FIELDS, PAYLOAD))}Give {', '.join(FIELDS[:2])}, dof_damping, "
             fail(key, "is no number that varies", f"{cure}payload, … (see Robot.vary)")
+        if key in OF_PLANTS and not physics.limited:
+            what = "varies in plants alone: the model that is planned with has nothing of it"
+            fail(key, what, "Give it to Robot.vary")
         shape = physics.own[key] if key in physics.own else np.shape(getattr(physics.mjx, key))
         meaning = "Mass in kg" if key == PAYLOAD else "As in robot.plant.mjx"
         require_shape(key, value, (*batch, *shape), meaning)
@@ -67,6 +82,8 @@ def require_numbers(
         value = np.asarray(value)
         if key in NONNEGATIVE and np.any(value < 0):
             fail(key, f"holds {value.min():g}", "Give numbers of at least 0")
+        if key in DIRECTIONS and not np.all(np.any(value != 0, axis=-1)):
+            fail(key, "holds a direction of length zero", "Give one of any other length")
         if "solimp" in key and np.any(value[..., 0] > value[..., 1]):
             fail(
                 key,

@@ -18,7 +18,7 @@ from jaxmpc.qp.linalg import matmul, solve, stand_ins
 from jaxmpc.robots.configurations import normalised, rates, retract
 from jaxmpc.robots.jaxpr_rewriting import in_pieces, moving, rewritten, with_forward_jacobian
 from jaxmpc.robots.mujoco_access import BALL, mjx_module, mujoco
-from jaxmpc.robots.parameters import FRICTIONS, PAYLOAD, TINY, acting_fields
+from jaxmpc.robots.parameters import DIRECTIONS, FRICTIONS, PAYLOAD, TINY, acting_fields
 from jaxmpc.robots.rigid_bodies import (
     FIELDS,
     Tree,
@@ -114,7 +114,7 @@ class Physics:
         if (physics := self.acting(numbers or {})) is not self:
             return physics.step(x, u, numbers)
         dtype = x.dtype
-        x, u, numbers = _widest((x, u, dict(numbers or {})))
+        x, u, numbers = _widest((x, u, in_force(numbers)))
         step = in_pieces(rewritten(self._step, {**stand_ins(), **self.tamed}))
         if not self.rows:
             return step(x, u, numbers).astype(dtype)
@@ -146,7 +146,7 @@ class Physics:
         Differentiable."""
         if (physics := self.acting(numbers or {})) is not self:
             return physics.data(x, u, numbers)
-        x, u, own = _widest((x, u, dict(numbers or {})))
+        x, u, own = _widest((x, u, in_force(numbers)))
         x_q, v, act = jnp.split(x, [self.model.nq, self.model.nq + self.model.nv])
         q = normalised(self.joints, x_q)
         M, bias, poses = self._dynamics(own, q, v)
@@ -285,12 +285,7 @@ class Physics:
         fixed = {key: np.array(getattr(self.mjx, key), q.dtype)[..., None] for key in FIELDS}
         off = bool(self.model.opt.disableflags & NO_GRAVITY)
         fixed["gravity"] = (0.0 if off else 1.0) * np.array(self.mjx.opt.gravity, q.dtype)[:, None]
-        unit = lambda v: v / jnp.linalg.norm(v, axis=-1, keepdims=True)
-        own = {
-            key: unit(value) if key.endswith("quat") else value
-            for key, value in numbers.items()
-            if key in (*FIELDS, PAYLOAD)
-        }
+        own = {key: value for key, value in numbers.items() if key in (*FIELDS, PAYLOAD)}
         call = lambda own, *rest: function(self.tree, {**fixed, **own}, *rest)
         return side_by_side(call)(jax.tree.map(lambda v: jnp.asarray(v, q.dtype), own), q, *rest)
 
@@ -362,6 +357,13 @@ def _without_margins(model: Any) -> dict[str, Any]:
         fields[f"{kind}_range"] = ends + margin[:, None] * inwards
         fields[f"{kind}_margin"] = np.zeros(margin.shape)
     return fields
+
+
+def in_force(numbers: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Return numbers, directions among them with length one, as MuJoCo's compiler makes them."""
+    unit = lambda v: jnp.asarray(v) / jnp.linalg.norm(jnp.asarray(v), axis=-1, keepdims=True)
+    given = dict(numbers or {})
+    return given | {key: unit(v) for key, v in given.items() if key in DIRECTIONS}
 
 
 def _widest(tree: Any) -> Any:

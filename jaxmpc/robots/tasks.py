@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array
 from scipy.spatial.transform import Rotation
 
-from jaxmpc.checks import fail, require_finite, require_shape
+from jaxmpc.checks import fail, number, require_finite, require_kind, require_shape, shown
 from jaxmpc.qp.linalg import matmul
 from jaxmpc.robots.mujoco_access import names, number_of
 from jaxmpc.robots.physics import NO_GRAVITY
@@ -43,11 +43,13 @@ def orientation(
     name: of the site, body or geom. target: a quaternion (w, x, y, z). kind: "site", "body" or
     "geom".
 
-    Its length is the angle between both, at most π, where it has no derivative.
+    Its length is the angle between both, at most π, where it jumps: either of two axes is right.
     """
     i, field = _number(robot, kind, name), "xmat" if kind == "body" else f"{kind}_xmat"
     require_shape("target", target, (4,), "Give a quaternion (w, x, y, z)")
     require_finite("target", target)
+    if not np.any(target):
+        fail("target", "is (0, 0, 0, 0), which is no orientation", "Give a quaternion (w, x, y, z)")
     wanted = Rotation.from_quat(np.roll(np.asarray(target, float), -1)).as_matrix()
 
     def turned(data: Any) -> Array:
@@ -56,10 +58,16 @@ def orientation(
         axis = jnp.stack([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / 2
         # |axis| = sin φ, trace = 1 + 2 cos φ. φ/sin φ → 1 + sin²φ/6 for small angles.
         square, cosine = jnp.sum(axis**2), (jnp.trace(R) - 1) / 2
-        small = square < 1e-8
-        sine = jnp.sqrt(jnp.where(small, 1.0, square))
-        ratio = jnp.where(small, 1 + square / 6, jnp.arctan2(sine, cosine) / sine)
-        return ratio * axis
+        obtuse, small = cosine < 0, square < 1e-8
+        sine = jnp.sqrt(jnp.where(small | obtuse, 1.0, square))
+        near = jnp.where(small, 1 + square / 6, jnp.arctan2(sine, cosine) / sine) * axis
+        # About π the axis n is that of (R + R')/2 − cos φ 1 = (1 − cos φ) n n', by its longest row.
+        outer = jnp.where(obtuse, (R + R.T) / 2 - cosine * jnp.eye(3, dtype=R.dtype), 1.0)
+        row = outer[jnp.argmax(jnp.diagonal(outer))]
+        n = row / jnp.sqrt(jnp.sum(row**2))
+        n = jnp.where(jnp.dot(n, axis) < 0, -n, n)
+        far = jnp.arctan2(jnp.dot(n, axis), jnp.where(obtuse, cosine, 1.0)) * n
+        return jnp.where(obtuse, far, near)
 
     return turned
 
@@ -76,8 +84,12 @@ def distance(robot: Robot, first: str, second: Any) -> Callable[[Any], Array]:
         segments.append(_segment(robot, second))
         radius = 0.0
     else:
+        if not isinstance(second, tuple | list) or len(second) != 2:
+            fail("second", shown(second), "Give the name of a geom, or (centre, radius)")
+        require_shape("second[0]", second[0], (3,), "Give the centre of the ball")
+        require_finite("second[0]", second[0])
+        number("second[1]", second[1], 0.0, "Give a radius of at least 0")
         centre, radius = np.asarray(second[0], float), float(second[1])
-        require_shape("second[0]", centre, (3,), "Give the centre of the ball")
         segments.append(lambda data: (jnp.asarray(centre, data.qpos.dtype),) * 2 + (0.0,))
 
     def between(data: Any) -> Array:
@@ -93,6 +105,7 @@ def energy(robot: Robot) -> Callable[[Any], Array]:
     """Return the function that gives the kinetic energy and that of the weight (J), zero at rest at
     the height of the world's origin; without springs. Its masses are those of the model that is
     planned with, `numbers` and a payload included."""
+    require_kind("robot", robot, Robot)
     model = robot.predictor.mjx
     gravity = np.asarray(model.opt.gravity) * (not model.opt.disableflags & NO_GRAVITY)
     root = np.asarray(model.body_rootid)

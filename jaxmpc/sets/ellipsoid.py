@@ -11,6 +11,7 @@ from jaxmpc.arrays import Reals, as_array, host_array, store_floats
 from jaxmpc.checks import (
     concrete,
     fail,
+    generator,
     require_finite,
     require_shape,
     require_symmetric_psd,
@@ -213,7 +214,7 @@ class Ellipsoid(BasicSet):
         """Return points (count, n) uniformly distributed over it; the same ones for the same
         seed."""
         center, L = self._ball()
-        random, n = np.random.default_rng(seed), len(L)
+        random, n = generator(seed), len(L)
         ball = random.standard_normal((sample_size(count), n))
         ball *= (random.uniform(size=(count, 1)) ** (1 / n)) / np.linalg.norm(
             ball, axis=1, keepdims=True

@@ -161,19 +161,20 @@ def _require_few(argument: str, what: str, m: int, k: int, most: int) -> None:
 
 
 def holds(center: np.ndarray, G: np.ndarray, x: np.ndarray, tolerance: float) -> bool:
-    """Return whether center + G w = x to within `tolerance` and 1e-10 of the half-widths for some
-    |w_i| <= 1, by one LP."""
+    """Return whether center + G w = x to within `tolerance`, 1e-10 of the half-widths and the
+    rounding of x and the center for some |w_i| <= 1, by one LP."""
     size, apart = reach(G), x - center
-    if np.any(~(np.abs(apart) <= tolerance + size * (1 + 2 * INSIDE))):
+    allowed = tolerance + 4 * np.finfo(float).eps * (np.abs(x) + np.abs(center))
+    if np.any(~(np.abs(apart) <= allowed + size * (1 + 2 * INSIDE))):
         return False
     m, moves = G.shape[1], size > 0
     if not moves.any():
         return True
-    G, size, apart = G[moves], size[moves], apart[moves]
+    G, size, apart, allowed = G[moves], size[moves], apart[moves], allowed[moves]
     # Least t with |apart - G w| <= tolerance + t size.
     identity, zeros = np.eye(m), np.zeros((2 * m, 1))
     rows = np.vstack(
         [np.c_[G, -size], np.c_[-G, -size], np.c_[np.vstack([identity, -identity]), zeros]]
     )
-    limits = np.concatenate([apart + tolerance, tolerance - apart, np.ones(2 * m)])
+    limits = np.concatenate([apart + allowed, allowed - apart, np.ones(2 * m)])
     return maximise(-np.eye(m + 1)[-1], rows, limits).value >= -INSIDE

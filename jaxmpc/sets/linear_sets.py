@@ -24,6 +24,7 @@ from jaxmpc.arrays import Reals, as_array, dimensions, host_array, store_floats
 from jaxmpc.checks import (
     concrete,
     fail,
+    generator,
     number,
     require_finite,
     require_names,
@@ -149,7 +150,7 @@ class LinearSet(BasicSet):
         count, part = sample_size(count), self.full_part()
         if part.part is None:
             return np.tile(part.point, (count, 1))
-        found = polyhedra.spread(part.part.vertices(), count, np.random.default_rng(seed))
+        found = polyhedra.spread(part.part.vertices(), count, generator(seed))
         return part.point + found @ part.basis.T
 
     def _closest(self, x: np.ndarray) -> np.ndarray:
@@ -848,7 +849,7 @@ class Box(LinearSet):
         """Return points (count, n) uniformly distributed over the box; the same ones for the same
         seed. ValueError if it is empty or unbounded."""
         lower, upper = self._finite_bounds()
-        random = np.random.default_rng(seed)
+        random = generator(seed)
         return random.uniform(lower, upper, (sample_size(count), len(lower)))
 
     def vertices(self) -> np.ndarray:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from jaxmpc.arrays import Reals, as_array
-from jaxmpc.checks import entries, fail, require_kind
+from jaxmpc.checks import entries, fail, generator, require_kind
 from jaxmpc.pytrees import record
 from jaxmpc.sets import drawing
 from jaxmpc.sets.fields import AnyTruth
@@ -61,7 +61,7 @@ class PolytopeUnion:
         volumes = np.array([piece.volume() for piece in pieces])
         if not (len(volumes) and 0 < volumes.sum() < np.inf):
             fail("sample", "of a union without volume, or unbounded", "Sample its pieces")
-        random = np.random.default_rng(seed)
+        random = generator(seed)
         which = random.choice(len(volumes), sample_size(count), p=volumes / volumes.sum())
         found = np.zeros((count, pieces[0].dimension))
         for i, piece in enumerate(pieces):

@@ -173,9 +173,9 @@ def _at(mpc: MPC, name: str) -> np.ndarray:
     *parts, last = _path(name)
     part: Any = mpc
     try:
-        part = reduce(getattr, parts, mpc)
-        value = getattr(part, last)
-    except AttributeError:
+        part = reduce(_part, parts, mpc)
+        value = _part(part, last)
+    except (AttributeError, IndexError):
         if part is None and hasattr(mpc, parts[0]):
             whole = ".".join(parts)
             fail(
@@ -184,6 +184,7 @@ def _at(mpc: MPC, name: str) -> np.ndarray:
                 f"Give it, with {last!r} to start from",
             )
         fail("learn", f"{name!r} is no field of the problem", f"Give names {known}")
+    part = _alone(part)
     field = getattr(part, "__dataclass_fields__", {}).get(last)
     if field is None:  # a property, or an attribute of an array
         fail("learn", f"{name!r} is no field of the problem", f"Give names {known}")
@@ -197,6 +198,18 @@ def _at(mpc: MPC, name: str) -> np.ndarray:
     return host_array(name, value)
 
 
+def _part(whole: Any, name: str) -> Any:
+    """Return a field, or the part of a tuple with this number. Of a tuple with one part the number
+    may be left out: "soft.rho" for "soft.0.rho"."""
+    if isinstance(whole, tuple) and name.isdecimal():
+        return whole[int(name)]
+    return getattr(_alone(whole), name)
+
+
+def _alone(whole: Any) -> Any:
+    return whole[0] if isinstance(whole, tuple) and len(whole) == 1 else whole
+
+
 def _parameter(name: str, value: np.ndarray) -> Parameter:
     """Return the parameter that starts at the value, in the domain of its field."""
     field = _path(name)[-1]
@@ -208,5 +221,8 @@ def _parameter(name: str, value: np.ndarray) -> Parameter:
 def _with(part: Any, path: list[str], value: Array) -> Any:
     """Return the problem, or a part of it, with another value at a path."""
     first, *rest = path
+    if isinstance(part, tuple):
+        i, rest = (int(first), rest) if first.isdecimal() else (0, path)
+        return (*part[:i], _with(part[i], rest, value), *part[i + 1 :])
     inner = _with(getattr(part, first), rest, value) if rest else value
     return replace(part, **{first: inner})

@@ -131,6 +131,7 @@ def tune_solver(
     controller = objective.controller
     data = controller.mpc, tracked, controller.solver, train, test, penalties
     decides["fingerprint"] = fingerprint(decides, data)
+    decides["given_rho"] = np.asarray(given.rho, float).tolist()
 
     def tune() -> TuningRun:
         with jax.enable_x64(True):

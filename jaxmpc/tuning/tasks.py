@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmpc.arrays import Reals, numpy_array
-from jaxmpc.checks import fail, require_memory
+from jaxmpc.checks import fail, generator, require_memory
 from jaxmpc.closed_loop.outcome import evaluate_runs
 from jaxmpc.closed_loop.robot_controller import RobotController, robot_references
 from jaxmpc.closed_loop.simulation import Run, simulate_many
@@ -415,7 +415,7 @@ def feasible_states(
     """
     require_memory("count", 8 * count * mpc.system.n, "Tune on fewer states")
     rows = Inequalities.of(FeasibilityProblem.of(mpc).condensed)
-    random, without_plan = np.random.default_rng(seed), 0
+    random, without_plan = generator(seed), 0
     found: list[np.ndarray] = []
     for _ in range(TRIES * count):
         x = random.uniform(lower, upper)

@@ -12,7 +12,7 @@ import optax
 
 from jaxmpc.arrays import Reals, numpy_array
 from jaxmpc.batches import chosen_devices
-from jaxmpc.checks import fail, nearest, whole
+from jaxmpc.checks import fail, generator, nearest, whole
 from jaxmpc.closed_loop.simulation import Conditions, Run, initial_states, require_variations
 from jaxmpc.mpc.problem import MPC, harden
 from jaxmpc.qp.admm import ADMM
@@ -204,7 +204,7 @@ def _starting_points(
                     cure = f"{nearest(str(name), parameters)}Give values of {', '.join(parameters)}"
                     fail("starts", f"holds {name!r}, which is no parameter", cure)
         return [parameters, *(moved(parameters, given) for given in starts)]
-    random, theta = np.random.default_rng(seed), raw(parameters)
+    random, theta = generator(seed), raw(parameters)
     draw = lambda: {name: v + random.normal(size=v.shape) for name, v in theta.items()}
     others = range(whole("starts", starts, 1) - 1)
     return [parameters, *(moved(parameters, exact_values(parameters, draw())) for _ in others)]

@@ -184,7 +184,7 @@ class StoredPolicies:
             self.section = Dyadic.of(section["center"]), Dyadic.of(section["generators"])
             r = self.rows
             taken = taken_by_section(described, r.A[0], r.B[0], r.H, r.D)
-            columns = [np.array(k, object).T for k in taken]
+            columns = [np.array(k, object).reshape(-1, 2).T for k in taken]
             self.taken = [[Dyadic.of_fractions(v) for v in pair] for pair in columns]
         self.state, self.plan, self.answer = (
             np.asarray(arrays[f"policy_{name}"], float) for name in ("state", "plan", "answer")

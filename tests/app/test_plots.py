@@ -340,7 +340,10 @@ def test_weights_that_move_alike_stay_in_sight():
 @pytest.mark.parametrize("count", [1, 5])
 def test_no_panel_of_the_solver_is_empty(residual, count):
     run = SimpleNamespace(
-        settings={"blocks": [("states", [0, 1, 2], 2), ("terminal", [3], 4), ("none", [], 0)]},
+        settings={
+            "blocks": [("states", [0, 1, 2], 2), ("terminal", [3], 4), ("none", [], 0)],
+            "given_rho": 0.6,
+        },
         solver=SimpleNamespace(rho=np.full((3, 10), 0.1)),
     )
     before, after = np.full(count, residual), np.full(count, 1e-12)

@@ -56,6 +56,12 @@ def test_runs_are_stored_resumed_and_those_of_simulate_many(tmp_path, monkeypatc
     with pytest.raises(ValueError, match="data: "):
         simulate_into(path, other, joint, x0s, STEPS, resume=True, **options)
 
+    heavy = joint.vary(body_mass=2 * joint.file.body_mass)
+    slow = jm.load_robot("joint", control_period=0.02)
+    for plant in (heavy, slow):
+        with pytest.raises(ValueError, match="plant: "):
+            simulate_into(path, feedback, plant, x0s, STEPS, resume=True, **options)
+
     begun = []
     found = simulate_into(
         path, feedback, joint, x0s, STEPS, resume=True, begun=lambda: begun.append(1), **options

@@ -172,6 +172,8 @@ def test_a_data_set(samples, tmp_path):
     size = np.abs(x @ c.F.T).max()
     assert np.abs(gradient[plans.solved]).max() < 1e-4 * size
     assert samples.to_xarray(plans)["multipliers"].dims == ("sample", "row")
+    weighed = replace(samples, mpc=replace(samples.mpc, input_rate_weight=0.1))
+    assert weighed.to_xarray().sizes["state"] == samples.x0s.shape[1]
     with pytest.raises(ValueError, match="path: .*npz"):
         samples.save(tmp_path / "data.txt")
     with pytest.raises(ValueError, match=r"plans: \(1,\) plans for 4096"):

@@ -565,3 +565,27 @@ class TestSlow:
         assert holds(report) == (False, False, False)
         assert report.counterexample.distance == pytest.approx(0.0039968, abs=1e-5)
         assert dataclasses.asdict(report)["feasible_set"] is not None
+
+
+def test_what_a_law_loses_that_leads_onto_facets():
+    """Half of the optimal next states lie on a facet, where rounding is no loss. Against the law in
+    closed form (N = 1: the least input that reaches the set) at 400,000 states."""
+    A = np.array([[1.18780659, 0.05406567], [-0.64109519, 0.52707389]])
+    B = np.array([-0.06265925, 1.91244472])
+    X, U = jm.Box([-0.987, -0.7845], [0.6506, 0.5095]), jm.Box(-0.934, 0.9236)
+    mpc = jm.MPC(jm.LinearSystem(A, B), [1, 1], 0.1, 1, states=X, inputs=U, terminal_set=X)
+    report = jm.recursive_feasibility(mpc, seconds=20, search=False)
+
+    def ends(free):
+        sides = [(end - free) / B for end in X.bounds()]
+        low, high = np.minimum(*sides).max(axis=1), np.maximum(*sides).min(axis=1)
+        return np.maximum(low, U.lower), np.minimum(high, U.upper)
+
+    points = np.random.default_rng(0).uniform(*X.bounds(), (400_000, 2))
+    low, high = ends(points @ A.T)
+    kept = low <= high
+    after = points @ A.T + np.clip(0, low, high)[:, None] * B
+    low, high = ends(np.clip(after[kept], *X.bounds()) @ A.T)
+    share = np.mean(low > high + 1e-9)
+    assert share == pytest.approx(0.1301, abs=0.002)
+    assert report.lost_by_law / report.volume == pytest.approx(share, abs=0.002)

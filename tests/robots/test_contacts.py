@@ -57,6 +57,20 @@ def standing():
     return hopper().standing(["foot"], friction=0.5)
 
 
+def test_contact_forces_of_numbers_that_vary(standing):
+    """Compensated gravity, which the file leaves out, takes the load off the foot."""
+    x, u = standing.equilibrium()
+    with jax.enable_x64(True):
+        forces = lambda share, u: standing.predictor.contact_forces(
+            x, u, {"body_gravcomp": np.full(standing.mujoco.nbody, share)}
+        )
+        weight = 9.81 * standing.mujoco.body_mass.sum()
+        np.testing.assert_allclose(forces(0.0, u)[0], weight, rtol=1e-6)
+        np.testing.assert_allclose(forces(1.0, 0 * u), 0, atol=1e-9)
+        with pytest.raises(ValueError, match="body_masss: is no number that varies"):
+            standing.predictor.contact_forces(x, u, {"body_masss": np.ones(3)})
+
+
 def balance(robot, x, u):
     """Accelerations and contact forces of feet at rest by M a = τ + J'λ, J a + J̇ v = −β J v.
 

@@ -194,6 +194,26 @@ def test_energy_and_inertias_are_those_of_the_model_that_varies():
     np.testing.assert_allclose(found._impl.cinert, inertia, atol=1e-9)
 
 
+def test_directions_have_length_one(motor):
+    """As MuJoCo's compiler makes them."""
+    x, u = np.array([0.3, 0, 0.1, 0]), np.array([0.3])
+    tilted = np.array([[0.0, 2.0, 0.2], [3.0, 0.0, 0.0]])
+    engine = mujoco.MjModel.from_xml_string(MOTOR.format("").replace("0 1 0", "0 2 .2"))
+    engine.dof_invweight0[:] = motor.file.dof_invweight0
+    found = motor.vary(jnt_axis=tilted).step(x, u)
+    np.testing.assert_allclose(found, c_steps(engine, x, u, motor.substeps), atol=1e-10)
+    with pytest.raises(ValueError, match="jnt_axis: holds a direction of length zero"):
+        motor.vary(jnt_axis=np.zeros((2, 3)))
+
+
+def test_variations_of_a_robot_that_was_varied(motor):
+    """Factors are of its own numbers, not of those of its file."""
+    heavy = motor.vary(body_mass=3 * motor.file.body_mass, body_inertia=3 * motor.file.body_inertia)
+    same = randomised(heavy, 2, mass=(1.0, 1.0))
+    for name, value in same.items():
+        np.testing.assert_array_equal(value[1], heavy.numbers[name])
+
+
 def test_what_does_nothing_is_refused(motor):
     model = RobotModel(motor, {"dof_dampingpoly": np.ones((2, 2))})
     many = {"body_mass": np.ones((3, 3)) * [[1.0], [1.0], [-1.0]]}
@@ -208,6 +228,12 @@ def test_what_does_nothing_is_refused(motor):
         (lambda: model.step(np.zeros(4), np.zeros(1)), "dof_dampingpoly: is no number"),
         (lambda: model.linearize(np.zeros(4), np.zeros(1)), "dof_dampingpoly: is no number"),
         (lambda: motor.linearize(np.zeros(4), np.zeros(1), numbers={"a": 1}), "a: is no number"),
+        (
+            lambda: motor.linearize(
+                np.zeros(4), np.zeros(1), numbers={"geom_size": np.ones((2, 3))}
+            ),
+            "geom_size: varies in plants alone",
+        ),
         (lambda: require_variations(motor, many, 3), "body_mass: holds -1"),
     ):
         with pytest.raises(ValueError, match=message):

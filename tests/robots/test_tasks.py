@@ -1,6 +1,7 @@
 """Tasks of robots: functions of mjx.Data against MuJoCo's C engine, and closed loops with them."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -156,11 +157,45 @@ class TestFunctions:
             (lambda r: tasks.distance(r, "wall", "ball"), "neither a sphere nor a capsule"),
             (lambda r: tasks.distance(r, "left", ([0, 0], 1)), r"second\[0\]: shape \(2,\)"),
             (lambda r: tasks.orientation(r, "tip", [1, 0, 0]), r"target: shape \(3,\)"),
+            (lambda r: tasks.orientation(r, "tip", np.zeros(4)), r"target: is \(0, 0, 0, 0\)"),
+            (lambda r: tasks.distance(r, "left", 5), "second: 5. Give the name of a geom, or"),
+            (lambda r: tasks.distance(r, "left", ([0, 0, 0],)), "second: .*Give the name"),
+            (lambda r: tasks.distance(r, "left", ([0, np.nan, 0], 1)), r"second\[0\]: holds NaN"),
+            (lambda r: tasks.distance(r, "left", ([0, 0, 0], -1)), r"second\[1\]: -1. Give a"),
+            (lambda r: tasks.energy(5), "robot: is a int. Give a jm.robots.Robot"),
         ],
     )
     def test_errors(self, two, make, text):
         with pytest.raises(ValueError, match=text):
             make(two)
+
+
+def test_orientations_of_every_angle(two, x64):
+    """Against SciPy, also next to half a turn, where the sine is as small as next to none; and the
+    derivative of the angle along the axis is one."""
+    function = tasks.orientation(two, "tip")
+    site = mujoco.mj_name2id(two.mujoco, mujoco.mjtObj.mjOBJ_SITE, "tip")
+    rng = np.random.default_rng(0)
+
+    def turned(vector):
+        half, norm = jnp.asarray(vector), jnp.sqrt(jnp.sum(vector**2))
+        x, y, z = half / norm
+        K = jnp.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        R = jnp.eye(3) + jnp.sin(norm) * K + (1 - jnp.cos(norm)) * K @ K
+        every = jnp.zeros((two.mujoco.nsite, 3, 3)).at[site].set(R)
+        return function(SimpleNamespace(site_xmat=every))
+
+    for away in (0.0, 1e-9, 1e-5, 5e-5, 2e-4, 1e-2, 1.0, 1.7, 3.0):
+        for axis in (*np.eye(3), *rng.normal(size=(5, 3))):
+            n = axis / np.linalg.norm(axis)
+            vector = (np.pi - away) * n
+            found = turned(vector)
+            if away == 0 and found @ n < 0:
+                found = -found
+            np.testing.assert_allclose(found, vector, atol=1e-7 if away < 1e-8 else 1e-9)
+            if away > 1e-8:
+                _, slope = jax.jvp(turned, (vector,), (n,))
+                np.testing.assert_allclose(slope, n, atol=1e-6)
 
 
 @pytest.fixture(scope="module")

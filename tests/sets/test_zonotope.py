@@ -132,3 +132,11 @@ def test_many_generators_need_no_square_of_their_number():
 def test_errors(center, generators, message):
     with pytest.raises(ValueError, match=message):
         Zonotope(center, generators).validate("W", 2)
+
+
+def test_samples_of_flat_zonotopes_lie_in_them():
+    """Also where a coordinate has no width at all, and the centre is no round number."""
+    for generators in ([[0.0], [0.0]], [[1.0], [0.0]], [[1.0], [0.3]]):
+        flat = Zonotope([1 / 3, 20 / 7], generators)
+        assert np.all(flat.contains(flat.sample(50)))
+    assert not Zonotope([1.0, 2.0], [[1.0], [0.0]]).contains([1.0, 2 + 1e-12])

@@ -21,6 +21,25 @@ MPC = jm.MPC(
     inputs=jm.Box([-0.5], [0.5]),
     soft=jm.Soft(np.eye(2), [-0.6, -0.6], [0.6, 0.6], rho=0.4),
 )
+
+
+def test_rows_that_soften_made_have_names():
+    """A tuple, whose number may be left out where it has one part."""
+    one = jm.soften(jm.MPC(jm.LinearSystem([[1.0]], [1.0]), 1.0, 0.1, 3, jm.Box(-1.0, 1.0)), 5.0)
+    two = replace(one, soft=(*one.soft, *one.soft))
+    for mpc, names in ((one, ("soft.rho", "soft.0.rho")), (two, ("soft.0.rho", "soft.1.rho"))):
+        for i, name in enumerate(names):
+            layer = jm.tuning.MPCLayer(mpc, learn=(name,))
+            theta = {name: layer.init()[name] + 1.0}
+            soft = layer.problem(theta).soft
+            changed = [np.any(s.rho != one.soft[0].rho) for s in soft]
+            assert changed == [k == i or len(soft) == 1 for k in range(len(soft))]
+    with pytest.raises(ValueError, match="'soft.rho' is no field"):
+        jm.tuning.MPCLayer(two, learn=("soft.rho",))
+    with pytest.raises(ValueError, match="'soft.2.rho' is no field"):
+        jm.tuning.MPCLayer(two, learn=("soft.2.rho",))
+
+
 NAMES = ("Q", "R", "A", "B", "inputs.upper", "soft.rho")
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import jax
 import numpy as np
+import problems
 import pytest
 
 import jaxmpc as jm
@@ -344,3 +345,19 @@ def test_the_first_example_gains_and_a_loss_of_the_controllers_own_says_so(tmp_p
     assert last < 0.7 * first and found["after"]["at_target"] > found["before"]["at_target"]
     assert run(f"weights --updates 0 --settling 0 --output {tmp_path / 'b'}") == 0
     assert "little can be gained" in capsys.readouterr().out
+
+
+@pytest.mark.long
+def test_the_picture_has_residuals_of_the_default():
+    """Whose penalty is None."""
+    mpc = problems.joint(5)
+    given, other = (
+        replace(tune_solver.GIVEN, iterations=20),
+        ADMM(iterations=20, newton_steps=0, rho=0.3),
+    )
+    states = np.array([[0.1, 0.2], [-0.3, 0.1]])
+    worst = tune_solver.largest_residuals(mpc, states, (given, other))
+    assert np.all(np.isfinite(worst))
+    own = replace(given, rho=float(jm.Controller(mpc, given).factor.rho[0, 0]))
+    same = tune_solver.largest_residuals(mpc, states, (own, other))
+    np.testing.assert_allclose(same, worst, rtol=1e-3, atol=1e-9)

@@ -159,8 +159,8 @@ def solver_rows(run: TuningRun, states: int, infeasible: int) -> list[tuple[str,
     return [
         ("", two_columns(("default", "as written"))),
         ("solved", two_columns(solved, f"of {states} states")),
-        ("residual", two_columns(residual, "median")),
-        ("rho", two_columns(("1", spread))),
+        ("residual", two_columns(residual, "median, of its tolerance")),
+        ("rho", two_columns((f"{run.settings['given_rho']:.3g}", spread))),
         ("alpha", two_columns(("1.6", f"{alpha:.4g}"))),
         ("infeasible", f"{infeasible:,} states drawn have no plan: left out"),
     ]
@@ -174,14 +174,9 @@ def penalties(run: TuningRun) -> tuple[np.ndarray, float]:
 def largest_residuals(mpc: MPC, states: np.ndarray, solvers: tuple[ADMM, ADMM]) -> np.ndarray:
     """Return the largest residual (2, B) with each solver, of the states that neither proves
     infeasible."""
-    shape = np.broadcast_shapes(*(np.shape(solver.rho) for solver in solvers))
-    wide = [
-        dataclasses.replace(s, rho=np.broadcast_to(np.asarray(s.rho, float), shape))
-        for s in solvers
-    ]  # one program for both
     with jax.enable_x64(True):
         each = jax.jit(lambda s: jax.vmap(lambda x: solve(mpc, x, solver=s))(states))
-        plans = [jax.tree.map(np.asarray, each(solver)) for solver in wide]
+        plans = [jax.tree.map(np.asarray, each(solver)) for solver in solvers]
     worst = [np.max([p.primal_residual, p.dual_residual, np.abs(p.gap)], axis=0) for p in plans]
     feasible = np.all([p.status != Status.PRIMAL_INFEASIBLE for p in plans], axis=0)
     return np.array(worst)[:, feasible]

@@ -27,7 +27,8 @@ class TuneSolverOptions:
       initial states, runs the steps, and moves rho and alpha down the gradient of the number of
       digits by which the residuals are too large. Some of the states (--validation) are the
       validation set: the result is the best of all steps on these; where none is better than the
-      default (rho = 1, alpha = 1.6) the table says so and the default is kept.
+      default (one rho, by the numbers of inputs and rows, alpha = 1.6) the table says so and the
+      default is kept.
       ADMM converges to the same plan for every rho: a bad rho costs steps, not correctness.
       Without a file the problem is one robot joint: x = (q, dq), torque u, 20 steps of 0.01 s.
 
@@ -39,7 +40,7 @@ class TuneSolverOptions:
     How to read the table
       solved      validation states whose residuals (primal, dual, gap) are all within 1e-6 after
                   --iterations steps, without Newton steps; with the default and with the result
-      residual    median over these states of the largest residual
+      residual    median over these states of the largest residual, in parts of its tolerance
       infeasible  states drawn within the limits from which no plan keeps the limits, by linear
                   programs; neither counted above nor learned from
       learning    seconds, compiling included

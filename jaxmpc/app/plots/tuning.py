@@ -288,7 +288,7 @@ def plot_solver(
         _logarithmic(ax, np.array([low, high]))
         ax.set_ylim(min(low, 0.5), max(high, 2.0))
         ax.tick_params(labelleft=bool(ax is axes[0]))
-        ax.axhline(1.0, color=EDGE, lw=0.7, zorder=0)
+        ax.axhline(run.settings["given_rho"], color=EDGE, lw=0.7, zorder=0)
     axes[0].set_ylabel("penalty rho, scaled rows")
     stages = [
         Line2D([], [], color=colour, label=f"stage {i + 1}") for i, colour in enumerate(shades)
