@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.arrays import Reals, as_weight, host_array
-from jaxmpc.checks import concrete, fail, require_untraced, whole
+from jaxmpc.checks import concrete, fail, number, require_untraced, whole
 from jaxmpc.closed_loop.feedback import one_state
 from jaxmpc.closed_loop.nonlinear_controller import (
     at_rest,
@@ -82,7 +82,8 @@ def robot_mpc(
     if not callable(getattr(robot, "linearize", None)):
         fail("robot", f"is a {type(robot).__name__}", "Give a Robot or a LinearPlant")
     whole("horizon", horizon, 1)
-    if not 0 <= margin < 1:
+    number("margin", margin, 0.0, "Give a fraction in [0, 1)")
+    if not margin < 1:
         fail("margin", f"{margin}", "Give a fraction in [0, 1)")
     Q, R = _weights(robot, Q, R)
     rests = True
@@ -295,6 +296,8 @@ class RobotController:
         sqp_steps: int = 1,
         hessian: Literal["exact", "gauss-newton"] = "gauss-newton",
     ) -> None:
+        if not isinstance(tasks, tuple | list):
+            fail("tasks", f"is a {type(tasks).__name__}", "Give a tuple of jm.mpc.Task: (task,)")
         solver = DEFAULT if solver is None else solver
         if solver.iterations is None and linearize != "set-point":
             solver = replace(solver, iterations=0)

@@ -126,6 +126,7 @@ def examine(
     """Return the report of `recursive_feasibility`; settled: when its stage 1 has to end."""
     require_kind("mpc", mpc, MPC)
     mpc.require_constant(SAME, *HARD)
+    require_kind("search", search, bool, cure="Give True or False")
     problem = problem_of(mpc)
     p = problem.dimension
     steps, max_regions = whole("steps", steps, 1), whole("max_regions", max_regions, 0)

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from jax import Array
 
+from jaxmpc.arrays import dimensions
 from jaxmpc.checks import fail
 from jaxmpc.mpc.steady_state import equilibrium
 from jaxmpc.pytrees import pytree, static
@@ -28,7 +29,7 @@ class LinearPlant:
     name: str = static(default="linear")
 
     def __post_init__(self) -> None:
-        if not isinstance(self.system, LinearSystem) or np.ndim(self.system.A) != 2:
+        if not isinstance(self.system, LinearSystem) or dimensions(self.system.A) != 2:
             return  # what JAX puts in place of arrays
         if self.home is None:
             object.__setattr__(self, "home", np.zeros(self.n))

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmpc.arrays import Reals, numpy_array
-from jaxmpc.checks import fail, generator, require_memory
+from jaxmpc.checks import fail, generator, require_finite, require_memory
 from jaxmpc.closed_loop.outcome import evaluate_runs
 from jaxmpc.closed_loop.robot_controller import RobotController, robot_references
 from jaxmpc.closed_loop.simulation import Run, simulate_many
@@ -387,6 +387,8 @@ def initial_range(
     for name, given in (("lower", lower), ("upper", upper)):
         if given is not None and len(given) != len(low):
             fail(name, f"has {len(given)} numbers", f"The problem has {len(low)} states")
+        if given is not None:
+            require_finite(name, np.asarray(given, float))
     bounded = np.isfinite(low) & np.isfinite(high)
     low, high = np.where(bounded, low, np.nan), np.where(bounded, high, np.nan)
     middle, half = (high + low) / 2, (high - low) / 2

@@ -215,6 +215,7 @@ KEYS = [
     ("dt = 1.0", "dt =", "is no TOML"),
     ("dt = 1.0", "dt = 1,0", "is no TOML"),
     ("dt = 1.0", "dt = True", "is no TOML"),
+    ("dt = 1.0", "dt = .1", "is no TOML .* Numbers begin with a digit"),
     ("dt = 1.0", "dt: 1.0", "is no TOML"),
     ("[mpc]", "[mpc]\n\0", "is no TOML"),
     ("grid = [3, 4]", "grid = " + "[" * 5000 + "]" * 5000, "case.toml: is nested too deeply"),

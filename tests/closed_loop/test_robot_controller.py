@@ -1,5 +1,6 @@
 """Robots under MPC: plans against another solver, closed loops against limits and linear ones."""
 
+from dataclasses import replace
 from functools import cache
 
 import cvxpy as cp
@@ -337,6 +338,11 @@ def test_bad_problems_and_controllers_are_named(pendulum, linear_mpc):
     for call, message in (
         (lambda: make(PLANT, Q, R, margin=1.0), r"margin: 1.0. Give a fraction in \[0, 1\)"),
         (lambda: make(PLANT, Q, R, margin=-0.1), "margin: -0.1"),
+        (lambda: make(PLANT, Q, R, margin="a"), "margin: 'a' where real numbers are needed"),
+        (
+            lambda: jm.RobotController(PLANT, replace(mpc, system=replace(mpc.system, dt=0.5))),
+            "mpc: has dt = 0.5, the robot a period of",
+        ),
         (lambda: make(PLANT, [1.0, 2.0, 3.0], R), "Q: "),
         (lambda: make(PLANT, Q, [1.0, 1.0]), "R: "),
         (lambda: make(PLANT, [-1.0, 1.0], R), "Q: .*semidefinite"),

@@ -373,6 +373,10 @@ def require_sizes(command: TuneWeights, steps: int, n: int, m: int) -> None:
     needed = 8 * command.count * (steps + 1) * (n + m)
     require_memory("--count, --steps", needed, "Tune on fewer loops, or shorter ones")
     require_lengths(command, "The problem", tracking=n, effort=m)
+    for name in ("tracking", "effort"):
+        given = getattr(command, name)
+        if given is not None and not min(given) >= 0:
+            fail(f"--{name}", f"{min(given):g}", "Give weights of at least 0")
 
 
 def with_margin(config: configs.Config, command: TuneWeights) -> configs.Config:
