@@ -46,11 +46,9 @@ OF_PLANTS = (
 )
 # Given in any length, they have length one.
 DIRECTIONS = ("body_quat", "body_iquat", "geom_quat", "site_quat", "jnt_axis")
-NONNEGATIVE = (
-    *("body_mass", "body_inertia", "dof_armature", "tendon_armature", PAYLOAD),
-    *("dof_frictionloss", "tendon_frictionloss"),
-)
 FRICTIONS = ("dof_frictionloss", "tendon_frictionloss")
+INERTIAS = ("body_mass", "body_inertia", "dof_armature", "tendon_armature", PAYLOAD)
+NONNEGATIVE = (*INERTIAS, *FRICTIONS)
 # Fields for whose zeros in the file a program has no force.
 ABSENT_AT_ZERO = (*FRICTIONS, "body_gravcomp")
 # In place of zero: a row of dry friction whose bound is zero is an equality to MJX, and locks.

@@ -309,12 +309,14 @@ class Robot(RobotDescription):
         theirs.
 
         numbers: fields of mjx.Model by name, such as body_mass (nbody,), dof_damping (nv,),
-        dof_armature, actuator_gear, all of `jaxmpc.robots.parameters.FIELDS`; or payload (kg): a
-        point mass at the site "tool", a number. Works under `jax.vmap`, which is how a batch gets
-        a robot each; the inverse weights that shape MuJoCo's soft limits stay those of the file.
-        With other gears, gains or ranges of forces the plant clamps forces as its file says.
-        Each acts as in MuJoCo's C engine. Raises ValueError for other names and shapes, and for
-        negative masses.
+        actuator_gear: of bodies mass, inertia, places and gravcomp, of joints axis, place, springs,
+        damping, armature, dry friction and stops, of shapes place, size and contact, of tendons,
+        actuators and equalities their parameters (`jaxmpc.robots.parameters.FIELDS`). Or payload
+        (kg): a point mass at the site "tool", a number. Each acts as in MuJoCo's C engine, where
+        nothing else of the file changes with it: inverse weights, which shape soft limits, stay.
+        With other gears, gains or ranges of forces the plant clamps forces as its file says. Works
+        under `jax.vmap`, which is how a batch gets a robot each. Raises ValueError for other names
+        and shapes, and for negative masses.
         """
         require_numbers(self.plant, numbers)
         return replace(self, numbers={**self.numbers, **numbers})
