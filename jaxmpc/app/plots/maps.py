@@ -10,7 +10,6 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path
-from scipy.spatial import ConvexHull
 
 from jaxmpc.app.plots.style import (
     COLUMN,
@@ -34,6 +33,7 @@ from jaxmpc.recursion.report import RecursionReport
 from jaxmpc.robot_maps.robot_map import RobotMap
 from jaxmpc.sets.convex_sets import Polytope
 from jaxmpc.sets.drawing import plot
+from jaxmpc.sets.geometry import convex_hull, hull_volume
 
 
 def plot_feasible_set(
@@ -112,7 +112,7 @@ def plot_body(fmap: FeasibleSetMap) -> Figure:
     figure.suptitle(_map_title(fmap), x=0.01, ha="left", fontsize=8 if small else 11)
     share = ""
     if len(inner) and len(outer):
-        share = f" ({ConvexHull(inner).volume / ConvexHull(outer).volume:.1%} of it)"
+        share = f" ({hull_volume(inner) / hull_volume(outer):.1%} of it)"
     lines: list[tuple[np.ndarray, str, Style]] = [
         (outer, "outer bound", {"color": OUTER, "lw": 2.4}),
         (inner, f"inner bound{share}", {"color": INNER, "lw": 1.4, "ls": (0, (3, 3))}),
@@ -123,7 +123,8 @@ def plot_body(fmap: FeasibleSetMap) -> Figure:
         for corners, _, style in lines:
             if len(corners):
                 shadow = corners[:, [i, j]]
-                around = shadow[ConvexHull(shadow).vertices]
+                hull, kept = convex_hull(shadow / np.ptp(shadow, axis=0))
+                around = shadow[kept[hull.vertices]]
                 ax.fill(*around.T, color=FEASIBLE if corners is inner else UNDECIDED, lw=0)
                 ax.plot(*np.vstack([around, around[:1]]).T, solid_joinstyle="round", **style)
         ax.set_xlabel(names[i])
