@@ -18,7 +18,7 @@ from jaxmpc.checks import fail
 from jaxmpc.mpc.condense import Inequalities, row_lengths
 from jaxmpc.pytrees import record
 from jaxmpc.sets.convex_sets import Polytope
-from jaxmpc.sets.geometry import affine_hull, framed
+from jaxmpc.sets.geometry import Empty, Flat, affine_hull, framed
 from jaxmpc.sets.lp import ROUNDING, Program, bound, extent, maximise, power_of_two
 
 # Bounds of linear programs are trusted to this, relative to the size of the set.
@@ -226,11 +226,17 @@ def projected(plans: PlanPolytope, deadline: float = np.inf) -> CenteredPolytope
     """
     if plans.p > DIMENSIONS:
         return f"vertices are not enumerated in {plans.p} dimensions (up to {DIMENSIONS} they are)"
+    flat = "the feasible set is flat: it has no volume"
+    if plans.flat:
+        return flat
     try:
         center = plans.center()
+    except Empty:
+        return "the feasible set is empty"
+    except Flat:
+        return flat
     except ValueError as error:
-        empty = "empty" in str(error)
-        return "the feasible set is " + ("empty" if empty else "flat: it has no volume")
+        return f"its facets are too ill-conditioned ({error})"
     extent = plans.extent
     if not np.all(np.isfinite(extent[: plans.p])):
         return "the feasible set is unbounded"

@@ -21,6 +21,7 @@ from jaxmpc.mpc.tightening import feedback_gain
 from jaxmpc.pytrees import record
 from jaxmpc.sets.convex_sets import Polytope, set_bounds
 from jaxmpc.sets.disturbances import disturbance_set, supports
+from jaxmpc.sets.geometry import Empty, Flat
 from jaxmpc.sets.terminal_hypotheses import verify_terminal
 from jaxmpc.systems.system import host_matrices
 
@@ -333,11 +334,13 @@ def settle_by_regions(claims: Claims, max_regions: int, deadline: float = np.inf
 
 
 def _volume(body: Polytope) -> float:
-    """Return the volume of a polytope, 0 where it is empty or flat."""
+    """Return the volume of a polytope, 0 where it is empty or flat, NaN where it is not found."""
     try:
         return body.volume()
-    except ValueError:  # empty or flat
+    except (Empty, Flat):
         return 0.0
+    except ValueError:  # too ill-conditioned
+        return np.nan
 
 
 def every_input_leaves(state: np.ndarray) -> Claim:

@@ -11,6 +11,7 @@ import numpy as np
 import scipy
 
 from jaxmpc.checks import fail
+from jaxmpc.sets.geometry import convex_hull
 
 _MARGIN = 0.08  # of the picture round bounded sets, as a fraction of their size
 _ON = 1e-7  # a corner lies on a row within this fraction of the set's size
@@ -198,7 +199,7 @@ def polygons(V: np.ndarray) -> list[np.ndarray] | None:
     if flat:
         return [V[_around(S @ axes[:2].T)]]
     try:
-        normals = np.unique(np.round(scipy.spatial.ConvexHull(S).equations, 9), axis=0)
+        normals = np.unique(np.round(convex_hull(S)[0].equations, 9), axis=0)
     except scipy.spatial.QhullError:
         return None
     found = []
