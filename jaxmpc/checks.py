@@ -252,7 +252,7 @@ def require_symmetric_psd(argument: str, value: Any, *, definite: bool = False) 
                 cure = f"For one half of a symmetric matrix use {whole}"
                 fail(argument, "is triangular, not symmetric", cure)
         fail(argument, "is not symmetric", f"Use ({argument} + {argument}.T) / 2")
-    least = np.linalg.eigvalsh((matrix + matrix.T) / 2)[0]
+    least = np.linalg.eigvalsh(matrix / 2 + matrix.T / 2)[0]
     if definite and least <= 0:
         what = f"is not positive definite (least eigenvalue {least:.3g})"
         fail(argument, what, "Put a positive weight on every direction")

@@ -897,6 +897,21 @@ def test_a_plant_whose_step_returns_no_state_is_named(found, value):
         jm.simulate(LAW, Returns(value), x, 3)
 
 
+@pytest.mark.parametrize(
+    "plant",
+    [
+        lambda x, u: np.array([x[0], u[0]]),
+        lambda x, u: x if x[0] > 0 else -x,
+        lambda x, u: jnp.array([float(x[0]), u[0]]),
+    ],
+)
+def test_a_plant_that_is_not_written_in_jax_is_told_what_helps(plant):
+    with pytest.raises(ValueError, match="plant: is not written in JAX .* Use jax.numpy"):
+        jm.simulate(LAW, plant, x, 3)
+    with pytest.raises(ValueError, match="plant: is not written in JAX .* Use jax.numpy"):
+        jm.simulate_many(LAW, plant, [x], 3)
+
+
 def test_errors_inside_a_constructor_stay_what_they_are():
     @record
     class Sized:

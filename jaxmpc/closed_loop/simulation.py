@@ -40,7 +40,7 @@ from jaxmpc.qp.status import Status
 from jaxmpc.robots.parameters import require_numbers
 from jaxmpc.robots.robot import Robot
 from jaxmpc.sets.limits import worst_violation
-from jaxmpc.systems.given_model import as_argument, is_model
+from jaxmpc.systems.given_model import as_argument, is_model, written_in_jax
 from jaxmpc.systems.system import LinearSystem
 
 
@@ -384,7 +384,8 @@ class Loop:
             estimates=state,
             disturbances=disturbances,
         )
-        after = self.plant.step(x, u)
+        with written_in_jax("plant"):
+            after = self.plant.step(x, u)
         shape = getattr(after, "shape", None)
         if shape != x.shape:
             what = f"shape {shape}" if shape is not None else f"a {type(after).__name__}"

@@ -504,7 +504,8 @@ class MPC:
         lengths = blocks if isinstance(blocks, tuple) else (blocks,)
         whole = all(isinstance(b, int | np.integer) and not isinstance(b, bool) for b in lengths)
         if not whole or min(lengths, default=0) < 1 or not lengths:
-            fail("control_horizon", f"{blocks!r}", "Give a number of moves, or block lengths")
+            cure = "Give a number of moves, or a tuple of block lengths, such as (1, 1, 3)"
+            fail("control_horizon", f"{blocks!r}", cure)
         if isinstance(blocks, tuple) and sum(blocks) != N:
             fail("control_horizon", f"{blocks} adds up to {sum(blocks)}", f"Make it {N} steps")
         if not isinstance(blocks, tuple) and blocks > N:

@@ -1,5 +1,7 @@
 """Models and plants that users write, as arguments of compiled programs."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from types import FunctionType
 from typing import Any
@@ -9,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxmpc.checks import fail
 from jaxmpc.pytrees import pytree, short_value, static, static_pytree
 
 
@@ -37,8 +40,27 @@ class ConstantPart:
 
 
 def as_array_of_numbers(found: Any) -> Any:
-    """Return what a user's function gives, of a list or tuple of numbers an array."""
-    return jnp.asarray(found) if isinstance(found, list | tuple) else found
+    """Return what a user's function gives, of a list or tuple of numbers an array. ValueError for
+    a list of parts of unequal shapes."""
+    if not isinstance(found, list | tuple):
+        return found
+    try:
+        return jnp.asarray(found)
+    except (TypeError, ValueError):
+        shapes = [getattr(part, "shape", type(part).__name__) for part in found]
+        what = f"gives a {type(found).__name__} of parts {shapes}"
+        return fail("a model, plant or task", what, "Join them: jnp.concatenate, or jnp.hstack")
+
+
+@contextmanager
+def written_in_jax(what: str) -> Iterator[None]:
+    """Turn errors of JAX about a user's function, while it is traced, into a ValueError."""
+    try:
+        yield
+    except jax.errors.JAXTypeError as error:
+        problem = f"is not written in JAX ({str(error).splitlines()[0]})"
+        cure = "Use jax.numpy in place of numpy, and jnp.where or jax.lax.cond in place of if"
+        fail(what, problem, cure)
 
 
 def _same(a: Any, b: Any) -> bool:

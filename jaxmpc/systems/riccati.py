@@ -1,5 +1,6 @@
 """The infinite-horizon linear-quadratic regulator in discrete time."""
 
+import warnings
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -21,8 +22,9 @@ from jaxmpc.systems.units import natural_units
 UNREACHED = 1e-10
 # Doublings at most: 2^40 steps of a loop with spectral radius 1 - 1e-10 leave 1e-48.
 _DOUBLINGS = 40
-# Relative residual of the Riccati equation above which a traced P is no solution.
+# Relative residual of the Riccati equation, or step of Newton's method, above which P is none.
 _RESIDUAL = 1e-6
+_NEWTON = 20  # steps of Newton's method at most; from a stabilizing gain a few will do
 
 
 @pytree
@@ -81,12 +83,12 @@ def lqr(system: LinearSystem, Q: Reals, R: Reals) -> LQR:
     q, r = host_array("Q", Q), host_array("R", R)
     require_symmetric_psd("Q", q)
     require_symmetric_psd("R", r, definite=True)
-    units = natural_units(A, B, q, r)
+    units, moved = natural_units(A, B, q, r), _rank_tests(*natural_units(A, B).system(A, B))
     A, B = units.system(A, B)
-    q, r = units.weights((q + q.T) / 2, (r + r.T) / 2)
+    q, r = units.weights(q / 2 + q.T / 2, r / 2 + r.T / 2)
     weights, axes = np.linalg.eigh(q)
     output = np.sqrt(np.maximum(weights, 0.0))[:, None] * axes.T  # q = output'output
-    moved, seen = _rank_tests(A, B), _rank_tests(A.T, output.T)
+    seen = _rank_tests(A.T, output.T)
     (control, _), (cost, _) = _least(moved), _least(seen)
     unmoved = f"does not move {_described(moved, system.state_names)}"
     unseen = f"puts no weight on {_described(seen, system.state_names)}"
@@ -94,18 +96,26 @@ def lqr(system: LinearSystem, Q: Reals, R: Reals) -> LQR:
         fail("B", f"not stabilizable: {unmoved}", "Actuate that")
     if cost <= UNREACHED:
         fail("Q", f"not detectable: {unseen}", "Give it some")
+    # SciPy's matrices hold Q and R beside A: beyond 1 they hide its digits.
+    scale = 2.0 ** np.round(np.log2(max(np.abs(q).max(), np.abs(r).max())))
+    q, r = q / scale, r / scale
     try:
-        P = _refine(A, B, q, r, scipy.linalg.solve_discrete_are(A, B, q, r))
+        with np.errstate(all="ignore"):
+            P = scipy.linalg.solve_discrete_are(A, B, q, r)
+        P = _refine(A, B, q, r, _newton(A, B, q, r, P))
         K = _gain(A, B, r, P)
         radius = spectral_radius(A + B @ K)
     except (np.linalg.LinAlgError, ValueError):
         radius = np.inf
     if not radius < 1:  # too close to the threshold for the test above: name the likelier cause
         rest = "so the Riccati equation was not solved"
+        if min(control, cost) > 1e-6:
+            ratio = f"Q is {np.abs(q).max() / np.abs(r).max():.1e} of R in natural units, {rest}"
+            fail("Q, R", f"are too far apart for float64: {ratio}", "Give weights nearer together")
         if control <= cost:
             fail("B", f"hardly {unmoved}, {rest}", "Actuate that")
         fail("Q", f"hardly {unseen}, {rest}", "Give it some")
-    return LQR(K=units.gain(K), P=units.cost_matrix(P))
+    return LQR(K=units.gain(K), P=units.cost_matrix(scale * P))
 
 
 def spectral_radius(M: np.ndarray) -> float:
@@ -160,6 +170,29 @@ def cost_of_law(system: LinearSystem, K: Reals, Q: Reals, R: Reals) -> Array | n
 def _gain(A: np.ndarray, B: np.ndarray, R: np.ndarray, P: np.ndarray) -> np.ndarray:
     """Return K = -(R + B'PB)^-1 B'PA in NumPy."""
     return -np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
+
+
+def _newton(
+    A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray, P: np.ndarray
+) -> np.ndarray:
+    """Take steps of Newton's method from P while each is less than half as long as the one before:
+    the cost of the gain of P (Kleinman 1968, IEEE TAC 13). LinAlgError where they do not end."""
+    P, before = (P + P.T) / 2, np.inf
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", scipy.linalg.LinAlgWarning)
+        for _ in range(_NEWTON):
+            K = _gain(A, B, R, P)
+            closed = A + B @ K
+            if not spectral_radius(closed) < 1:
+                break
+            newer = scipy.linalg.solve_discrete_lyapunov(closed.T, Q + K.T @ R @ K)
+            step = np.abs(newer - P).max()
+            if not step < before / 2:
+                break
+            P, before = (newer + newer.T) / 2, step
+    if not before <= _RESIDUAL * np.abs(P).max():
+        raise np.linalg.LinAlgError("Newton's method does not converge")
+    return P
 
 
 def _refine(

@@ -420,6 +420,14 @@ BAD = {
         lambda p: solve_nonlinear(replace(p, tasks=(replace(p.tasks[0], stages=[0.5]),)), START),
         r"disc.stages: \(0.5,\)",
     ),
+    "parts": (
+        lambda p: solve_nonlinear(replace(p, model=lambda x, u: [x, u[0]]), START),
+        r"gives a list of parts \[\(2,\), \(\)\]. Join them: jnp.concatenate",
+    ),
+    "mask of stages": (
+        lambda p: solve_nonlinear(replace(p, tasks=(replace(p.tasks[0], stages=True),)), START),
+        r"disc.stages: \(True,\)",
+    ),
     "no weight": (
         lambda p: solve_nonlinear(replace(p, tasks=(Task(squared, target=2.0),)), START),
         "task.target: is given without a weight",
@@ -451,7 +459,13 @@ def test_what_has_one_meaning_is_taken(x64):
     inputs = [solve_nonlinear(p, START, iterations=2).inputs for p in (problem, lists(list))]
     np.testing.assert_allclose(*inputs, atol=1e-12)
     lists(tuple).validate()
-    for given, stages in ((2, (2,)), (range(2), (0, 1)), (np.arange(1, 3), (1, 2)), ([3], (3,))):
+    for given, stages in (
+        (2, (2,)),
+        (range(2), (0, 1)),
+        (np.arange(1, 3), (1, 2)),
+        ([3], (3,)),
+        (tuple(np.arange(2)), (0, 1)),
+    ):
         assert replace(problem.tasks[0], stages=given).stages == stages
 
 

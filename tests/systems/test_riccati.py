@@ -1,6 +1,7 @@
 """The linear-quadratic regulator, against closed forms and the Riccati equation."""
 
 import math
+from fractions import Fraction
 
 import jax
 import numpy as np
@@ -165,3 +166,38 @@ def test_lqr_errors(A, B, Q, R, message):
 def test_lqr_leaves_decaying_modes_alone():
     law = lqr(LinearSystem(np.diag([0.5, 1.2]), [[0], [1]]), np.diag([0, 1]), np.eye(1))
     assert law.K[0, 0] == 0 and law.P[0, 0] == 0
+
+
+def newton_step(A, B, Q, R, K):
+    """The gain after a step of Newton's method from K, in rational numbers: its error is the square
+    of that of K."""
+    A, B, Q, R, K = (np.vectorize(lambda v: Fraction(float(v)))(M) for M in (A, B, Q, R, K))
+    closed, n = A + B @ K, len(A)
+    # P − closed'P closed = Q + K'R K, entry by entry, by elimination.
+    rows = np.eye(n * n, dtype=int) - np.kron(closed.T, closed.T)
+    rows = np.column_stack([rows, (Q + K.T @ R @ K).ravel()])
+    for i in range(n * n):
+        pivot = i + int(np.argmax(rows[i:, i] != 0))
+        rows[[i, pivot]] = rows[[pivot, i]]
+        rows[i] = rows[i] / rows[i, i]
+        for k in set(range(n * n)) - {i}:
+            rows[k] = rows[k] - rows[k, i] * rows[i]
+    P = rows[:, -1].reshape(n, n)
+    return (-(B.T @ P @ A) / (R + B.T @ P @ B)[0, 0]).astype(float)
+
+
+@pytest.mark.parametrize("r", [1e-14, 1e-6, 1.0, 1e8, 1e10, 1e11, 1e12, 1e13, 1e14, 1e16])
+def test_gains_of_weights_in_small_units(r):
+    """An input in µN has R of 1e12 times that in N: K depends on Q/R alone."""
+    A, B = np.array([[1.0, 0.1], [0.0, 1.0]]), np.array([[0.0], [0.1]])
+    K = lqr(LinearSystem(A, B), np.eye(2), r).K
+    np.testing.assert_allclose(K[0], newton_step(A, B, np.eye(2), [[r]], K)[0], rtol=1e-8)
+
+
+def test_weights_of_any_size_are_no_matter_of_the_plant():
+    system = LinearSystem([[1.0, 0.1], [0.0, 1.0]], [0.0, 0.1])
+    K = lqr(system, np.eye(2), 0.1).K
+    for c in (1e-280, 1e280):
+        np.testing.assert_allclose(lqr(system, c * np.eye(2), 0.1 * c).K, K, rtol=1e-9)
+    with pytest.raises(ValueError, match="^Q"):
+        lqr(system, [1e-300, 1.0], 0.1)

@@ -37,7 +37,7 @@ from jaxmpc.mpc.stagewise.stages import Stages, remembering
 from jaxmpc.pytrees import named_pytree, pytree, static
 from jaxmpc.qp.linalg import apply, apply_transposed, matmul, symmetric
 from jaxmpc.qp.problem import Bounds
-from jaxmpc.systems.given_model import as_argument, closed, is_model, may_close_over
+from jaxmpc.systems.given_model import as_argument, closed, is_model, may_close_over, written_in_jax
 from jaxmpc.systems.system import LinearSystem
 
 
@@ -73,7 +73,7 @@ class Task:
     def __post_init__(self) -> None:
         if callable(self.function):
             object.__setattr__(self, "function", as_argument(self.function))
-        if self.stages is not None and not isinstance(self.stages, tuple):
+        if self.stages is not None:
             stages = tuple(np.atleast_1d(np.asarray(self.stages)).tolist())
             object.__setattr__(self, "stages", stages)
 
@@ -125,7 +125,9 @@ class Task:
                 fail(f"{name}.lower", "exceeds upper or is NaN", "Give lower ≤ upper")
         if self.stages is not None:
             given = self.stages
-            whole = all(isinstance(k, int) and 0 <= k <= horizon for k in given)
+            whole = all(
+                isinstance(k, int) and not isinstance(k, bool) and 0 <= k <= horizon for k in given
+            )
             if not whole or len(set(given)) != len(given) or not given:
                 fail(f"{name}.stages", f"{given}", f"Give different stages from 0 to {horizon}")
 
@@ -282,12 +284,8 @@ def _shapes(tree: Any, leaves: tuple) -> tuple[tuple[int, ...], list[tuple[int, 
         values = [problem.value(task, x, u) for task in problem.tasks]
         return problem.model.step(x, u), values, problem.view(x, u) if values else None
 
-    try:
+    with written_in_jax("model or task"):
         after, values, view = jax.eval_shape(outputs, abstract, x, u)
-    except jax.errors.JAXTypeError as error:
-        what = f"is not written in JAX ({str(error).splitlines()[0]})"
-        cure = "Use jax.numpy in place of numpy, and jnp.where or jax.lax.cond in place of if"
-        fail("model or task", what, cure)
     if not hasattr(after, "shape"):
         cure = f"Give the next state ({system.n},), an array of jax.numpy"
         fail("model.step(x, u)", f"gives a {type(after).__name__}", cure)
