@@ -21,6 +21,8 @@ from jaxmpc.sets.convex_sets import Polytope
 from jaxmpc.sets.geometry import Empty, Flat, affine_hull, framed
 from jaxmpc.sets.lp import ROUNDING, Program, bound, extent, maximise, power_of_two
 
+# Reasons why a set has no facets: it has no volume.
+EMPTY, FLAT = "the feasible set is empty", "the feasible set is flat: it has no volume"
 # Bounds of linear programs are trusted to this, relative to the size of the set.
 TOLERANCE = 1e-9
 # Facets are enumerated up to this dimension, and this many of them.
@@ -226,15 +228,14 @@ def projected(plans: PlanPolytope, deadline: float = np.inf) -> CenteredPolytope
     """
     if plans.p > DIMENSIONS:
         return f"vertices are not enumerated in {plans.p} dimensions (up to {DIMENSIONS} they are)"
-    flat = "the feasible set is flat: it has no volume"
     if plans.flat:
-        return flat
+        return FLAT
     try:
         center = plans.center()
     except Empty:
-        return "the feasible set is empty"
+        return EMPTY
     except Flat:
-        return flat
+        return FLAT
     except ValueError as error:
         return f"its facets are too ill-conditioned ({error})"
     extent = plans.extent

@@ -9,7 +9,14 @@ import numpy as np
 
 from jaxmpc.checks import entries, fail, require_kind, whole
 from jaxmpc.feasible.hard_constraints import augmented_dynamics
-from jaxmpc.feasible.plan_polytope import DIMENSIONS, FACETS, CenteredPolytope, projected
+from jaxmpc.feasible.plan_polytope import (
+    DIMENSIONS,
+    EMPTY,
+    FACETS,
+    FLAT,
+    CenteredPolytope,
+    projected,
+)
 from jaxmpc.feasible.policy_problem import MORE_ROOM, NO_VOLUME, problem_of
 from jaxmpc.mpc.plan import rate_ends
 from jaxmpc.mpc.problem import HARD, MPC, RELAX
@@ -51,7 +58,7 @@ def _polytope(mpc: MPC, body: CenteredPolytope | str) -> Polytope:
     if not isinstance(body, str):
         return body.polytope
     cure = "Map it with map_feasible_set, which has no such limit"
-    if _has_no_volume(body) and mpc.disturbance is not None and mpc.policy != "tightened":
+    if body in (EMPTY, FLAT) and mpc.disturbance is not None and mpc.policy != "tightened":
         body, cure = f"its feasible set {NO_VOLUME}", MORE_ROOM
     elif "empty" in body:
         cure = RELAX
@@ -70,10 +77,6 @@ def _all_facets(mpc: MPC) -> CenteredPolytope | str:
         return projected(plans)
     sets = backward(problem.mpc)
     return sets if isinstance(sets, str) else sets[1]
-
-
-def _has_no_volume(reason: str) -> bool:
-    return "is empty" in reason or "is flat" in reason
 
 
 def any_policy_polytope(mpc: MPC) -> Polytope:
@@ -182,7 +185,7 @@ def feasible_growth(mpc: MPC, horizons: Sequence[int]) -> Growth:
     sets = []
     for changed in (replace(mpc, horizon=N) for N in every):
         found = _all_facets(changed)
-        nothing = isinstance(found, str) and _has_no_volume(found)
+        nothing = isinstance(found, str) and found in (EMPTY, FLAT)
         sets.append(None if nothing else _polytope(changed, found))
     return Growth(
         horizons=np.array(every, int),

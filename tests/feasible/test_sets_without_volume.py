@@ -63,3 +63,16 @@ def test_flat_feasible_sets():
     with pytest.raises(ValueError, match="empty or flat.*Relax a limit"):
         feasible_polytope(robust)
     assert feasible_growth(robust, [2]).volume[0] == 0
+
+
+def test_a_flat_terminal_set_of_many_states_is_no_flat_feasible_set():
+    """Above four dimensions X_N is computed backwards from it, which says nothing of its volume."""
+    system = jm.LinearSystem(np.eye(5) + 0.5 * np.eye(5, k=1), np.eye(5)[:, -1:])
+    sides, rest = jm.Box(-np.ones(5), np.ones(5)), jm.Box(np.zeros(5), np.zeros(5))
+    mpc = jm.MPC(
+        system, np.eye(5), 0.1, 6, states=sides, inputs=jm.Box(-1.0, 1.0), terminal_set=rest
+    )
+    around = 1e-3 * np.vstack([np.eye(5), -np.eye(5)])
+    assert np.all(jm.solve_many(mpc, around).solved)  # a body about the origin
+    with pytest.raises(ValueError, match="facets are not found"):
+        feasible_growth(mpc, [6])
