@@ -18,24 +18,8 @@ if TYPE_CHECKING:
 
 # A point mass (kg) at the site "tool", beside the fields of mjx.Model.
 PAYLOAD, TOOL = "payload", "tool"
-# Fields that act as in MuJoCo's C engine.
-FIELDS = (
-    *("body_mass", "body_inertia", "body_ipos", "body_iquat", "body_pos", "body_quat"),
-    *("body_gravcomp", "body_invweight0", "dof_invweight0", "tendon_invweight0"),
-    *("dof_damping", "dof_armature", "dof_frictionloss", "dof_solref", "dof_solimp"),
-    *("jnt_stiffness", "qpos_spring", "qpos0", "jnt_pos", "jnt_axis"),
-    *("jnt_range", "jnt_margin", "jnt_solref", "jnt_solimp", "jnt_actfrcrange"),
-    *("geom_pos", "geom_quat", "geom_size", "geom_friction", "geom_margin", "geom_solmix"),
-    *("geom_solref", "geom_solimp", "site_pos", "site_quat"),
-    *("actuator_gear", "actuator_gainprm", "actuator_biasprm", "actuator_dynprm"),
-    *("actuator_forcerange", "actuator_actrange"),
-    *("tendon_stiffness", "tendon_damping", "tendon_lengthspring", "tendon_armature"),
-    *("tendon_range", "tendon_margin", "tendon_solref_lim", "tendon_solimp_lim"),
-    *("tendon_frictionloss", "tendon_solref_fri", "tendon_solimp_fri", "tendon_actfrcrange"),
-    *("eq_data", "eq_solref", "eq_solimp"),
-)
-# Of these the model that is planned with knows nothing: it has no contacts, stops, dry friction and
-# limits of forces, and the functions of `tasks.py` have the sizes of the file.
+# Fields of plants alone. The model that is planned with knows nothing of them: it has no contacts,
+# stops, dry friction and limits of forces, and the functions of `tasks.py` have the file's sizes.
 OF_PLANTS = (
     *("dof_frictionloss", "dof_solref", "dof_solimp"),
     *("tendon_frictionloss", "tendon_solref_fri", "tendon_solimp_fri"),
@@ -43,6 +27,17 @@ OF_PLANTS = (
     *("tendon_range", "tendon_margin", "tendon_solref_lim", "tendon_solimp_lim"),
     *("geom_size", "geom_friction", "geom_margin", "geom_solmix", "geom_solref", "geom_solimp"),
     *("actuator_forcerange", "tendon_actfrcrange"),
+)
+# Fields that act as in MuJoCo's C engine.
+FIELDS = (
+    *("body_mass", "body_inertia", "body_ipos", "body_iquat", "body_pos", "body_quat"),
+    *("body_gravcomp", "body_invweight0", "dof_invweight0", "tendon_invweight0"),
+    *("dof_damping", "dof_armature", "jnt_stiffness", "qpos_spring", "qpos0", "jnt_pos"),
+    *("jnt_axis", "geom_pos", "geom_quat", "site_pos", "site_quat"),
+    *("actuator_gear", "actuator_gainprm", "actuator_biasprm", "actuator_dynprm"),
+    *("actuator_actrange", "tendon_stiffness", "tendon_damping", "tendon_lengthspring"),
+    *("tendon_armature", "eq_data", "eq_solref", "eq_solimp"),
+    *OF_PLANTS,
 )
 # Given in any length, they have length one.
 DIRECTIONS = ("body_quat", "body_iquat", "geom_quat", "site_quat", "jnt_axis")

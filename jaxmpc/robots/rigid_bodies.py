@@ -130,6 +130,12 @@ class Tree:
         whole = {name: np.array(value, np.int32) for name, value in numbers.items()}
         return cls(**whole, **masks, tool=number_of(model, "site", TOOL))
 
+    def carries(self, v: Array) -> Array:
+        """Return what the payload adds (1, …) as that of all bodies (bodies, …): zeros but for the
+        body that holds it."""
+        holds = np.arange(len(self.tip)) == self.site_body[self.tool]
+        return holds.astype(v.dtype).reshape(-1, *(1,) * (v.ndim - 1)) * v
+
 
 class Bodies(NamedTuple):
     """Poses and what moves them: position (bodies, 3), quaternion (bodies, 4), matrix (bodies, 3,
@@ -274,8 +280,8 @@ def bodies(tree: Tree, model: Mapping[str, Any], q: Array) -> Bodies:
     if PAYLOAD in model:
         carrier = tree.site_body[[tree.tool]]
         tool = position[carrier] + rotated(quaternion[carrier], model["site_pos"][[tree.tool]])
-        weighed = weighed.at[carrier].add(model[PAYLOAD] * tool)
-        mass = (mass + 0 * model[PAYLOAD]).at[carrier].add(model[PAYLOAD])
+        load = tree.carries(model[PAYLOAD][None, None])
+        mass, weighed = mass + load, weighed + load * tool
     below, weight = total(tree.below, weighed), total(tree.below, mass)
     # MuJoCo's smallest mass that counts is 1e-15.
     centre = jnp.where(weight < 1e-15, middle, below / jnp.maximum(weight, 1e-15))
@@ -323,13 +329,12 @@ def inertias(tree: Tree, model: Mapping[str, Any], found: Bodies) -> Inertia:
     X, moments = found.principal, model["body_inertia"][:, None, :]
     own = jnp.sum((X * moments)[:, :, None] * X[:, None], axis=3)
     J, h, mass = _of_points(mass, arm)
-    J = own + J
-    if found.tool is not None:
-        carrier = tree.site_body[[tree.tool]]
-        held = _of_points(model[PAYLOAD][None], found.tool - found.centre[tree.root[carrier]])
-        J, h = J.at[carrier].add(held.J), h.at[carrier].add(held.h)
-        mass = (mass + 0 * held.mass).at[carrier].add(held.mass)
-    return Inertia(J, h, mass)
+    bare = Inertia(own + J, h, mass)
+    if found.tool is None:
+        return bare
+    apart = found.tool - found.centre[tree.root[tree.site_body[[tree.tool]]]]
+    held = _of_points(model[PAYLOAD][None], apart)
+    return jax.tree.map(lambda a, b: a + tree.carries(b), bare, held)
 
 
 def _of_points(mass: Array, arm: Array) -> Inertia:
