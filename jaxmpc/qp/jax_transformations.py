@@ -343,6 +343,52 @@ def kept_whole(function: Callable[..., R]) -> Callable[..., R]:
     return call
 
 
+def kept_unvarying(function: Callable[..., R]) -> Callable[..., R]:
+    """Return a function that fails inside `jax.shard_map` under its check, as one that does not.
+
+    For functions of other libraries whose loops and branches give what varies over the axes of the
+    mesh in one place, and what does not in another. It is traced apart from the mesh, as one
+    operation, whose results vary as the arguments together do. It has no derivatives there.
+    """
+
+    def call(*arguments: Any) -> R:
+        leaves, tree = jax.tree.flatten(arguments)
+        if not any(map(_axes, leaves)):
+            return function(*arguments)
+        flat = lambda *leaves: function(*jax.tree.unflatten(tree, leaves))
+        bare = [jax.ShapeDtypeStruct(jnp.shape(v), jnp.result_type(v)) for v in leaves]
+        program, shapes = jax.make_jaxpr(flat, return_shape=True)(*bare)
+        found = unvarying_p.bind(*map(jnp.asarray, leaves), program=program)
+        return varying(jax.tree.unflatten(jax.tree.structure(shapes), found), arguments)
+
+    return call
+
+
+unvarying_p = Primitive("kept_unvarying")
+unvarying_p.multiple_results = True
+
+
+@unvarying_p.def_abstract_eval
+def _(*arguments: Any, program: ClosedJaxpr) -> Any:
+    return program.out_avals
+
+
+def _batched_unvarying(arguments: Any, axes: Any, *, program: ClosedJaxpr) -> tuple[Any, Any]:
+    run = jax.vmap(jaxpr_as_fun(program), in_axes=tuple(axes))
+    bare = [jax.ShapeDtypeStruct(jnp.shape(v), jnp.result_type(v)) for v in arguments]
+    out = unvarying_p.bind(*arguments, program=jax.make_jaxpr(run)(*bare))
+    return out, [0] * len(out)
+
+
+def _lowered_unvarying(ctx: Any, *arguments: Any, program: ClosedJaxpr) -> Any:
+    bare = ctx.replace(avals_in=program.in_avals)
+    return mlir.lower_fun(jaxpr_as_fun(program), multiple_results=True)(bare, *arguments)
+
+
+batching.primitive_batchers[unvarying_p] = _batched_unvarying
+mlir.register_lowering(unvarying_p, _lowered_unvarying)
+
+
 whole_p = Primitive("kept_whole")
 whole_p.multiple_results = True
 

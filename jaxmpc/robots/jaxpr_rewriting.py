@@ -9,7 +9,7 @@ from jax import Array
 from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Primitive, jaxpr_as_fun
 
-from jaxmpc.qp.jax_transformations import default_platform
+from jaxmpc.qp.jax_transformations import default_platform, kept_unvarying
 from jaxmpc.qp.linalg import JAXLIB
 
 # How many operations XLA of old jaxlibs may fuse on a CPU.
@@ -158,13 +158,17 @@ def with_forward_jacobian(function: Callable) -> Callable:
 
     Reverse mode then transposes one matrix product instead of the function. It stores one Jacobian
     a step, and does not multiply infinite derivatives, as those of distances of shapes
-    that do not touch can be, by zeros.
+    that do not touch can be, by zeros. Both are `kept_unvarying`, as MJX's solver has to be.
     """
-    wrapped = jax.custom_jvp(function)
+    wrapped = jax.custom_jvp(kept_unvarying(function))
 
     def rule(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-        of, at, directions = moving(lambda *args: (function(*args),) * 2, primals, tangents)
-        jacobians, value = jax.jacfwd(of, argnums=tuple(range(len(at))), has_aux=True)(*at)
+        def slopes(*primals: Any) -> Any:
+            of, at, _ = moving(lambda *args: (function(*args),) * 2, primals, tangents)
+            return jax.jacfwd(of, argnums=tuple(range(len(at))), has_aux=True)(*at)
+
+        jacobians, value = kept_unvarying(slopes)(*primals)
+        directions = moving(function, primals, tangents)[2]
         products = (
             jnp.tensordot(J, d, d.ndim, precision="highest")
             for J, d in zip(jacobians, directions, strict=True)

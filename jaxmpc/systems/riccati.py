@@ -24,6 +24,7 @@ UNREACHED = 1e-10
 _DOUBLINGS = 40
 # Relative residual of the Riccati equation, or step of Newton's method, above which P is none.
 _RESIDUAL = 1e-6
+_TRACED_NEWTON = 3  # as traced
 _NEWTON = 20  # steps of Newton's method at most; from a stabilizing gain a few will do
 
 
@@ -279,22 +280,24 @@ def _doubling(A: Array, B: Array, Q: Array, R: Array) -> Array:
         k, *_, H, before = carry
         return (k < _DOUBLINGS) & (_size(H - before) > jnp.finfo(H.dtype).eps * _size(H))
 
-    G = matmul(B, solve(R, B.T))
+    # Where R is far below B'QB, its inverse is not for computing with, so R has a least part.
+    least = jnp.sqrt(jnp.finfo(Q.dtype).eps) * _size(B) ** 2 * _size(Q)
+    held = R + least * jnp.eye(R.shape[0], dtype=R.dtype)
+    G = matmul(B, solve(held, B.T))
     start: tuple[Array, ...] = (jnp.asarray(0), A, G, Q, jnp.full_like(Q, jnp.inf))
     P = jax.lax.while_loop(unfinished, double, varying(start, start))[3]
 
-    def recursion(P: Array) -> tuple[Array, Array]:  # as in `_refine`
-        K = _traced_gain(A, B, R, P)
+    def cost(K: Array) -> tuple[Array, Array]:
         closed = A + matmul(B, K)
-        P = matmul(closed.T, matmul(P, closed)) + Q + matmul(K.T, matmul(R, K))
-        return (P + P.T) / 2, closed
+        P, left = _power_sum(closed, Q + matmul(K.T, matmul(R, K)))
+        return (P + P.T) / 2, left
 
-    P, _ = recursion(P)
-    P, _ = recursion(P)
-    again, closed = recursion(P)
-    _, left = _power_sum(closed, Q)
-    good = (_size(again - P) <= _RESIDUAL * _size(P)) & (left < 1e-3)
-    return jnp.where(good, again, jnp.nan)
+    newton = lambda _, K: _traced_gain(A, B, R, cost(K)[0])  # as in `_newton`
+    K = jax.lax.fori_loop(0, _TRACED_NEWTON, newton, _traced_gain(A, B, held, P))
+    before, _ = cost(K)
+    P, left = cost(_traced_gain(A, B, R, before))
+    good = (_size(P - before) <= _RESIDUAL * _size(P)) & (left < 1e-3)
+    return jnp.where(good, P, jnp.nan)
 
 
 def _size(M: Array) -> Array:

@@ -347,3 +347,18 @@ def test_rewriting_leaves_the_rest():
     same = rewritten(function, {cholesky_p: by_hand})
     text = lambda f: str(jax.make_jaxpr(f)(np.ones(3, np.float32)))
     assert text(same) == text(function)
+
+
+# --- inside shard_map ------------------------------------------------------------------------
+
+
+@pytest.mark.long
+def test_stops_in_a_shard_map():
+    """MJX's own solver fails under the default check of what varies over the devices."""
+    robot, spec = jm.load_robot(swing("Euler")), jax.sharding.PartitionSpec("b")
+    mesh = jax.make_mesh((1,), ("b",), axis_types=(jax.sharding.AxisType.Auto,))
+    xs, us = jnp.array([[1.1, 1.0], [0.2, -1.0]]), jnp.array([[9.0], [-9.0]])
+    size = lambda x, u: jnp.sum(robot.step(x, u) ** 2)
+    steps = jax.vmap(lambda x, u: (robot.step(x, u), jax.grad(size, (0, 1))(x, u)))
+    shared = jax.shard_map(steps, mesh=mesh, in_specs=spec, out_specs=spec)
+    jax.tree.map(np.testing.assert_array_equal, jax.jit(shared)(xs, us), jax.jit(steps)(xs, us))

@@ -121,6 +121,20 @@ def test_units_decide_nothing(kind):
     assert (0 < refused < 20) == (kind in ("unmoved", "unseen"))
 
 
+@pytest.mark.parametrize("inputs", [1, 2])
+def test_traced_weights_far_apart(inputs):
+    """The inverse of R, which the doubling begins with, is not used where B'QB is far above R."""
+    A, B = np.diag([1.2, 0.9, 0.5]) + np.eye(3, k=1), np.ones((3, 1)) + 0.5 * np.eye(3, inputs)
+    traced = jax.jit(lambda Q, R: lqr(LinearSystem(A, B), Q, R))
+    for size in 10.0 ** np.arange(-14, 15, 4):
+        Q, R = size * np.eye(3), np.diag([1.0, 3, 0.1][:inputs])
+        law = lqr(LinearSystem(A, B), Q, R)
+        with jax.enable_x64(True):
+            found = traced(Q, R)
+        np.testing.assert_allclose(found.P, law.P, rtol=0, atol=1e-9 * np.abs(law.P).max())
+        np.testing.assert_allclose(found.K, law.K, rtol=0, atol=max(1e-9, 1e-15 * size))
+
+
 @pytest.mark.parametrize("weak", [1e-7, 1e-12, 1e-17])
 def test_weak_couplings_do_not_decide_units(weak):
     """Twelve states, three of which each input moves; everything acts weakly on everything."""
