@@ -308,8 +308,8 @@ CALLS = [
     ),
     ("constrain_initial: 'no'. Give True or False", lambda: mpc(constrain_initial="no").validate()),
     (
-        "constrained_stages: [1, 2]. Give a tuple of different",
-        lambda: mpc(constrained_stages=[1, 2]).validate(),
+        "constrained_stages: (True, False). Of a mask give np.flatnonzero(mask)",
+        lambda: mpc(constrained_stages=[True, False]).validate(),
     ),
     (
         "constrained_stages: (1, 9). Give a tuple of different",
@@ -320,8 +320,8 @@ CALLS = [
         lambda: mpc(constrained_stages=(1.5,)).validate(),
     ),
     (
-        "constrained_stages: 1. Give a tuple of different",
-        lambda: mpc(constrained_stages=1).validate(),
+        "constrained_stages: (4,). Give a tuple of different",
+        lambda: mpc(constrained_stages=4).validate(),
     ),
     (
         "control_horizon: 9 moves in 3 steps. Give at most",
@@ -341,8 +341,8 @@ CALLS = [
         lambda: mpc(control_horizon=(1, 1)).validate(),
     ),
     (
-        "control_horizon: [1, 2]. Give a number of moves,",
-        lambda: mpc(control_horizon=[1, 2]).validate(),
+        "control_horizon: (1, 2.0). Give a number of moves,",
+        lambda: mpc(control_horizon=[1, 2.0]).validate(),
     ),
     (
         "input_rate_weight: 'w' where real numbers are",

@@ -111,6 +111,7 @@ class Outputs(TwoSided):
 
     def __post_init__(self) -> None:
         store_floats(self, "C", "lower", "upper", "D")
+        store_stages(self, "stages")
 
 
 @pytree
@@ -143,6 +144,7 @@ class Soft(TwoSided):
 
     def __post_init__(self) -> None:
         store_floats(self, "C", "lower", "upper", "rho", "quadratic", "D")
+        store_stages(self, "stages")
 
 
 @named_pytree
@@ -274,6 +276,9 @@ class MPC:
         weights = ("Q", "R", "terminal_cost", "input_rate_weight", "stage_weights")
         store_floats(self, *weights, "prestabilise", "input_rate_limit")
         store_floats(self, "disturbance_matrix", "gain")
+        store_stages(self, "constrained_stages")
+        if isinstance(self.control_horizon, list | range | np.ndarray):
+            store_stages(self, "control_horizon")
         for name, cure in MADE_BY.items():
             if isinstance(getattr(self, name), str):
                 fail(name, f"{getattr(self, name)!r} is text, which files alone know", cure)
@@ -490,7 +495,7 @@ class MPC:
 
     def _validate_stages(self) -> None:
         N = self.horizon
-        _require_stages("constrained_stages", self.constrained_stages, N)
+        require_stages("constrained_stages", self.constrained_stages, N)
         blocks = self.control_horizon
         if blocks is None:
             return
@@ -502,8 +507,7 @@ class MPC:
         if given:
             fail("prestabilise", "given beside control_horizon", "Blocked inputs are u, not u − Kx")
         lengths = blocks if isinstance(blocks, tuple) else (blocks,)
-        whole = all(isinstance(b, int | np.integer) and not isinstance(b, bool) for b in lengths)
-        if not whole or min(lengths, default=0) < 1 or not lengths:
+        if not _whole_numbers(lengths) or min(lengths, default=0) < 1:
             cure = "Give a number of moves, or a tuple of block lengths, such as (1, 1, 3)"
             fail("control_horizon", f"{blocks!r}", cure)
         if isinstance(blocks, tuple) and sum(blocks) != N:
@@ -514,7 +518,7 @@ class MPC:
     def _validate_rows(self, name: str, rows: Soft | Outputs) -> None:
         """Raise ValueError unless rows have the sizes of the problem, at each of their stages."""
         last = self.horizon - (rows.D is not None)
-        _require_stages(f"{name}.stages", rows.stages, last)
+        require_stages(f"{name}.stages", rows.stages, last)
         find: Any = soft_stages if isinstance(rows, Soft) else output_stages
         for where, part in _stage_by_stage(name, rows, lambda: find(self, rows)):
             self._validate_rows_at(where, part)
@@ -714,13 +718,26 @@ def _form(M: np.ndarray, size: np.ndarray) -> np.ndarray:
     return abs(M).T @ size @ abs(M)
 
 
-def _require_stages(name: str, stages: Any, last: int) -> None:
+def store_stages(instance: Any, name: str) -> None:
+    """Make a tuple of a field of a frozen dataclass: of a number, a list, a range or an array."""
+    value = getattr(instance, name)
+    if value is not None:
+        object.__setattr__(instance, name, tuple(np.atleast_1d(np.asarray(value, object))))
+
+
+def _whole_numbers(values: tuple) -> bool:
+    """Return whether all are whole numbers; entries of a mask are none."""
+    return all(isinstance(k, int | np.integer) and not isinstance(k, bool) for k in values)
+
+
+def require_stages(name: str, stages: Any, last: int) -> None:
     """Raise ValueError unless `stages` is None or different whole numbers from 0 to `last`."""
     if stages is None:
         return
-    whole = isinstance(stages, tuple) and all(isinstance(k, int | np.integer) for k in stages)
-    if not whole or len(set(stages)) != len(stages) or not all(0 <= k <= last for k in stages):
-        fail(name, f"{stages!r}", f"Give a tuple of different stages from 0 to {last}")
+    whole = _whole_numbers(stages) and all(0 <= k <= last for k in stages)
+    if not whole or len(set(stages)) != len(stages):
+        mask = "Of a mask give np.flatnonzero(mask): " if any(k is True for k in stages) else ""
+        fail(name, f"{stages!r}", f"{mask}Give a tuple of different stages from 0 to {last}")
 
 
 def _stage_by_stage(name: str, part: Any, at: StagesOf | None) -> Iterator[tuple[str, Any]]:

@@ -1079,10 +1079,9 @@ WRONG = {
     "D NaN": (soft(D=EYE * np.nan), r"soft\[0\].D", "finite"),
     "stages beyond N": (soft(stages=(0, 5)), r"soft\[0\].stages", "from 0 to 4"),
     "D at N": (soft(D=EYE, stages=(4,)), r"soft\[0\].stages", "from 0 to 3"),
-    "stages a list": (soft(stages=[0, 1]), r"soft\[0\].stages", "tuple"),
     "stages twice": (soft(stages=(1, 1)), r"soft\[0\].stages", "different"),
     "stages negative": (soft(stages=(-1,)), r"soft\[0\].stages", "from 0"),
-    "stages a number": (soft(stages=2), r"soft\[0\].stages", "tuple"),
+    "a mask of rows": (soft(stages=[True, False]), r"soft\[0\].stages", "flatnonzero"),
     "names": (soft(names=("a",)), r"soft\[0\].names", "Give all or none"),
     "units": (soft(units=("a", "b", "c")), r"soft\[0\].units", "Give all or none"),
     "outputs: a number": (dict(outputs=3), "outputs", "Give a jm.Outputs"),
@@ -1093,7 +1092,7 @@ WRONG = {
     "outputs: D": (outputs(D=ONE), r"outputs\[0\].D", "One column an input"),
     "outputs: D at N": (outputs(D=EYE, stages=(4,)), r"outputs\[0\].stages", "from 0 to 3"),
     "outputs: names": (outputs(names=("a",)), r"outputs\[0\].names", "Give all or none"),
-    "stages: a list": (dict(constrained_stages=[1]), "constrained_stages", "tuple"),
+    "stages: a mask": (dict(constrained_stages=(False, True)), "constrained_stages", "mask"),
     "stages: beyond N": (dict(constrained_stages=(5,)), "constrained_stages", "0 to 4"),
     "stages: twice": (dict(constrained_stages=(1, 1)), "constrained_stages", "different"),
     "control_horizon 0": (dict(control_horizon=0), "control_horizon", "Give a number of moves"),
@@ -1103,7 +1102,7 @@ WRONG = {
     "control_horizon ()": (dict(control_horizon=()), "control_horizon", "block lengths"),
     "blocks too long": (dict(control_horizon=(2, 3)), "control_horizon", "Make it 4 steps"),
     "a block of 0": (dict(control_horizon=(1, 0, 3)), "control_horizon", "block lengths"),
-    "blocks a list": (dict(control_horizon=[2, 2]), "control_horizon", "block lengths"),
+    "blocks a mask": (dict(control_horizon=[True, 3]), "control_horizon", "block lengths"),
     "blocks and K": (dict(control_horizon=2, prestabilise=np.ones((2, 2))), "prestabilise", "u"),
     "blocks and LQR": (dict(control_horizon=2, prestabilise=True), "prestabilise", "u"),
     "rate weight: a number": (dict(input_rate_weight=1.0), "input_rate_weight", "Give"),
@@ -1125,6 +1124,20 @@ WRONG = {
                   "Loosen"),
     "inputs of three": (dict(inputs=jm.Polytope(np.eye(3), np.ones(3))), "inputs", "Bound"),
 }  # fmt: skip
+
+
+def test_numbers_of_steps_may_be_lists_ranges_and_arrays():
+    mpc = problems.joint(4)
+    cases = (([0, 2], (0, 2)), (range(1, 3), (1, 2)), (np.arange(2), (0, 1)), (3, (3,)))
+    for given, stages in cases:
+        rows = replace(mpc, constrained_stages=given)
+        assert rows.constrained_stages == stages and jm.Outputs(EYE, stages=given).stages == stages
+        assert jm.Soft(EYE, stages=given).stages == stages
+        rows.validate()
+    for given in ([1, 3], np.array([1, 3])):
+        blocks = replace(mpc, control_horizon=given)
+        blocks.validate()
+        assert blocks.control_horizon == (1, 3)
 
 
 @pytest.mark.parametrize("name", WRONG)

@@ -31,7 +31,7 @@ from jaxmpc.checks import (
     require_symmetric_psd,
 )
 from jaxmpc.mpc.plan import Aim
-from jaxmpc.mpc.problem import MPC, dynamics_of
+from jaxmpc.mpc.problem import MPC, dynamics_of, require_stages, store_stages
 from jaxmpc.mpc.rows import Rows, at, joined_bounds, spread
 from jaxmpc.mpc.stagewise.stages import Stages, remembering
 from jaxmpc.pytrees import named_pytree, pytree, static
@@ -73,9 +73,7 @@ class Task:
     def __post_init__(self) -> None:
         if callable(self.function):
             object.__setattr__(self, "function", as_argument(self.function))
-        if self.stages is not None:
-            stages = tuple(np.atleast_1d(np.asarray(self.stages)).tolist())
-            object.__setattr__(self, "stages", stages)
+        store_stages(self, "stages")
 
     @property
     def limited(self) -> bool:
@@ -123,13 +121,9 @@ class Task:
             upper = np.inf if self.upper is None else np.asarray(self.upper, float)
             if not np.all(lower <= upper):
                 fail(f"{name}.lower", "exceeds upper or is NaN", "Give lower ≤ upper")
-        if self.stages is not None:
-            given = self.stages
-            whole = all(
-                isinstance(k, int) and not isinstance(k, bool) and 0 <= k <= horizon for k in given
-            )
-            if not whole or len(set(given)) != len(given) or not given:
-                fail(f"{name}.stages", f"{given}", f"Give different stages from 0 to {horizon}")
+        require_stages(f"{name}.stages", self.stages, horizon)
+        if self.stages == ():
+            fail(f"{name}.stages", "is empty", f"Give stages from 0 to {horizon}, or no task")
 
 
 @named_pytree
