@@ -75,6 +75,8 @@ def require_numbers(
         value = np.asarray(value)
         if key in NONNEGATIVE and np.any(value < 0):
             fail(key, f"holds {value.min():g}", "Give numbers of at least 0")
+        if key == "body_inertia":
+            _require_triangle(value)
         if key in DIRECTIONS and not np.all(np.any(value != 0, axis=-1)):
             fail(key, "holds a direction of length zero", "Give one of any other length")
         if "solimp" in key and np.any(value[..., 0] > value[..., 1]):
@@ -83,6 +85,16 @@ def require_numbers(
                 "has d_0 > d_width, which MJX reads otherwise than MuJoCo",
                 "Give d_0 ≤ d_width",
             )
+
+
+def _require_triangle(moments: np.ndarray) -> None:
+    """Raise ValueError for principal moments (..., 3) of which one exceeds the sum of the others:
+    no distribution of mass has them (∫ y² + z² ≤ ∫ x² + z² + ∫ x² + y²)."""
+    largest, total = moments.max(axis=-1), moments.sum(axis=-1)
+    wrong = largest > (total - largest) * (1 + 1e-5)  # of a flat body they are equal
+    if np.any(wrong):
+        what = f"holds {moments[wrong][0]}, of which one exceeds the sum of the others"
+        fail("body_inertia", what, "Give the principal moments of a body, as MuJoCo takes them")
 
 
 def require_tool(model: "mujoco.MjModel") -> None:

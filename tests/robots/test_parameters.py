@@ -225,6 +225,10 @@ def test_what_does_nothing_is_refused(motor):
         (lambda: motor.vary(bodymass=1.0), "bodymass: is no number.*Did you mean body_mass"),
         (lambda: motor.vary(body_mass=[0.0, -1.0, 1.0]), "body_mass: holds -1. Give numbers of at"),
         (lambda: motor.vary(payload=-0.1), "payload: holds -0.1"),
+        (
+            lambda: motor.vary(body_inertia=motor.plant.mjx.body_inertia + np.array([1.0, 0, 0])),
+            "body_inertia: holds .* exceeds the sum",
+        ),
         (lambda: model.step(np.zeros(4), np.zeros(1)), "dof_dampingpoly: is no number"),
         (lambda: model.linearize(np.zeros(4), np.zeros(1)), "dof_dampingpoly: is no number"),
         (lambda: motor.linearize(np.zeros(4), np.zeros(1), numbers={"a": 1}), "a: is no number"),
