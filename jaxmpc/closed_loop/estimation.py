@@ -23,6 +23,7 @@ from jaxmpc.mpc.stagewise.nonlinear import NonlinearMPC, linear_model
 from jaxmpc.pytrees import named_pytree, pytree, static
 from jaxmpc.qp.linalg import arrays, matmul, solve, symmetric, symmetric_root
 from jaxmpc.robots.linear_plant import LinearPlant
+from jaxmpc.robots.parameters import PAYLOAD, require_numbers
 from jaxmpc.robots.robot import Robot, RobotModel
 from jaxmpc.systems.riccati import least_reached, lqr
 from jaxmpc.systems.system import LinearSystem, host_matrices
@@ -138,10 +139,12 @@ class Disturbance:
     kind: what M d is added to:
         "input"    u, M (m, k): ξ⁺ = f(ξ, u + M d), loads such as friction and payloads;
         "output"   what is measured, M (p, k): y = C ξ + M d, such as a sensor's offset;
-        "state"    the next state, M (n, k): ξ⁺ = f(ξ, u) + M d.
+        "state"    the next state, M (n, k): ξ⁺ = f(ξ, u) + M d;
+        a number of a robot's model, as `Robot.vary` names it ("payload", "dof_damping",
+                   "actuator_gear"), M (its entries, k): it is that of the model plus M d.
     process: of w, of one time step, in the unit of d; as in `Noise`. The larger, the sooner a
         change of d is followed, and the more measurement noise is taken for one.
-    matrix M: None for one d for each input, output or state.
+    matrix M: None for one d for each input, output, state or entry.
     initial: of the error of the first estimate d = 0, where the filter has `initial`.
 
     No more disturbances than measured outputs can be told from each other. With as many, and with
@@ -248,9 +251,7 @@ class KalmanFilter:
             fail("observer.disturbance", what, "Give a closed_loop.Disturbance, or several")
         for i, one in enumerate(given):
             name = f"observer.disturbance[{i}]"
-            if one.kind not in KINDS:
-                fail(f"{name}.kind", f"{one.kind!r}", f"Give one of {', '.join(KINDS)}")
-            rows = sizes[one.kind]
+            rows = sizes[one.kind] if one.kind in KINDS else self._entries(f"{name}.kind", one.kind)
             M = whole_array(np.eye(rows) if one.matrix is None else one.matrix)
             if M.ndim != 2 or M.shape[0] != rows or not M.shape[1]:
                 cure = f"Give ({rows}, k), a row for each {one.kind}, or None"
@@ -275,6 +276,42 @@ class KalmanFilter:
             fail("observer.disturbance", what, "Give at most one for each measured output")
         return tuple(found)
 
+    def _entries(self, name: str, kind: str) -> int:
+        """Return how many entries a number of the robot's model has; raise ValueError where it has
+        no such number."""
+        model = _robot_model(self.model)
+        if model is None:
+            cure = f"Give one of {', '.join(KINDS)}; with a Robot as the model also its numbers"
+            fail(name, f"{kind!r}", cure)
+        robot = model.robot
+        if kind not in robot.predictor.own and not hasattr(robot.predictor.mjx, kind):
+            require_numbers(robot.predictor, {kind: 0.0})  # names what there is
+        value = _number(model, kind)
+        require_numbers(robot.predictor, {kind: value})
+        return np.size(value)
+
+    @property
+    def estimates_numbers(self) -> bool:
+        """Return whether numbers of the robot's model are estimated."""
+        return any(one.kind not in KINDS for one in self._each)
+
+    def numbers(self, d: Array) -> dict[str, Array]:
+        """Return the numbers of the robot's model that are estimated, by name, where the
+        disturbances are d (k,); for `numbers=` of a `RobotController`."""
+        found, model = {}, _robot_model(self.model)
+        for kind in {one.kind for one in self._each}.difference(KINDS):
+            assert model is not None  # `prepared` says so
+            M, own = (jnp.asarray(v, d.dtype) for v in (self.matrix(kind), _number(model, kind)))
+            found[kind] = own + matmul(M, d).reshape(own.shape)
+        return found
+
+    def _informed(self, d: Array) -> Any:
+        """Return the model with these disturbances in its numbers."""
+        model = _robot_model(self.model)
+        if model is None or not self.estimates_numbers:
+            return self.model
+        return replace(model, numbers={**model.numbers, **self.numbers(d)})
+
     @property
     def linear_model(self) -> LinearSystem:
         """Return the LinearSystem of a linear model."""
@@ -296,8 +333,11 @@ class KalmanFilter:
         return mean[: self.model.n], mean[self.model.n :]
 
     def matrix(self, kind: str) -> Any:
-        """Return M with M d added to inputs, outputs or states (rows, k) of a prepared filter."""
-        rows = {"input": self.model.m, "output": self.p, "state": self.model.n}[kind]
+        """Return M with M d added to inputs, outputs, states or a number (rows, k) of a prepared
+        filter."""
+        rows = {"input": self.model.m, "output": self.p, "state": self.model.n}.get(kind)
+        if rows is None:
+            rows = next(len(one.matrix) for one in self._each if one.kind == kind)
         sizes = [(one, np.shape(one.matrix)[1]) for one in self._each]
         parts = [one.matrix if one.kind == kind else np.zeros((rows, k)) for one, k in sizes]
         return (np if concrete(parts) else jnp).concatenate([np.zeros((rows, 0)), *parts], axis=1)
@@ -393,14 +433,18 @@ class KalmanFilter:
                 jnp.asarray(self.matrix(k), d.dtype) for k in ("input", "state")
             )
             u, of_states = u + matmul(on_inputs, d), matmul(on_states, d)
-        after = model_step(self.model, xi, u)
+        model = self._informed(d)
+        after = model_step(model, xi, u)
         for more in (of_states, known):
             after = after if more is None else after + more
         after = jnp.concatenate([after, d])
         if P is None:
             return Belief(after, None)
-        A, B = (jnp.asarray(v, d.dtype) for v in _slopes(self.model, xi, u))
+        A, B = (jnp.asarray(v, d.dtype) for v in _slopes(model, xi, u))
         A, _ = self._with_disturbances(A, B)
+        if self.estimates_numbers:
+            of_numbers = jax.jacfwd(lambda d: model_step(self._informed(d), xi, u))(d)
+            A = jnp.asarray(A).at[: len(xi), len(xi) :].add(of_numbers)
         W = jnp.asarray(self._covariance("process"), d.dtype)
         return Belief(after, matmul(A, matmul(P, A.T)) + W)
 
@@ -468,6 +512,19 @@ def _gain(P: Array, C: Array, V: Array) -> Array:
     return solve(matmul(CP, C.T) + V, CP).T
 
 
+def _robot_model(model: Any) -> RobotModel | None:
+    """Return the model of a robot, None for other models."""
+    model = model.model if isinstance(model, NonlinearMPC) else model
+    model = RobotModel(model, exact=False) if isinstance(model, Robot) else model
+    return model if isinstance(model, RobotModel) else None
+
+
+def _number(model: RobotModel, kind: str) -> Any:
+    """Return a number of a model of a robot: its own, else that of the file."""
+    file = 0.0 if kind == PAYLOAD else np.asarray(getattr(model.robot.predictor.mjx, kind))
+    return model.numbers.get(kind, file)
+
+
 def model_step(model: Any, xi: Array, u: Array) -> Array:
     """Return the coordinates (n,) one time step later by a model: of a Robot, its predictor."""
     if isinstance(model, Robot):
@@ -479,6 +536,8 @@ def _slopes(model: Any, xi: Array, u: Array) -> tuple[Any, Any]:
     """Return A (n, n), B (n, m) of a model about ξ, u."""
     if isinstance(model, NonlinearMPC):
         return linear_model(model.model, xi, u)[:2]
-    if not isinstance(model, LinearSystem):
+    if isinstance(model, RobotModel):
+        model = model.linearize(xi, u)
+    elif not isinstance(model, LinearSystem):
         model = model.linearize(model.state(xi), u)
     return model.A, model.B

@@ -2,7 +2,7 @@
 by linear models."""
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import field, replace
 from typing import Any, Literal
 
@@ -13,7 +13,7 @@ from jax import Array
 
 from jaxmpc.arrays import Reals, as_weight, host_array
 from jaxmpc.checks import concrete, fail, number, require_untraced, whole
-from jaxmpc.closed_loop.feedback import one_state
+from jaxmpc.closed_loop.feedback import first_row, one_state
 from jaxmpc.closed_loop.nonlinear_controller import (
     at_rest,
     last_input,
@@ -29,7 +29,8 @@ from jaxmpc.mpc.stagewise.nonlinear import NonlinearMPC, Task
 from jaxmpc.mpc.stagewise.solve import factor_stages, solve_stagewise
 from jaxmpc.pytrees import prepared_pytree, static
 from jaxmpc.qp.admm import ADMM, DEFAULT
-from jaxmpc.qp.linalg import arrays, floating_dtype
+from jaxmpc.qp.linalg import arrays, floating_dtype, matmul, solve
+from jaxmpc.qp.newton import ridged
 from jaxmpc.robots.contacts import friction_cones, stands
 from jaxmpc.robots.description import host_coordinates
 from jaxmpc.robots.equilibria import settled
@@ -335,6 +336,11 @@ class RobotController:
         return self.fixed is not None
 
     @property
+    def takes_numbers(self) -> bool:
+        """Return whether plans take numbers of the robot's model."""
+        return self.fixed is None and isinstance(self.robot, Robot)
+
+    @property
     def limits(self) -> Box:
         """Return the robot's own state limits, without margin."""
         return self.robot.state_limits
@@ -357,10 +363,14 @@ class RobotController:
         input_reference: Reals | None = None,
         previous_input: Reals | None = None,
         forecast: Reals | None = None,
+        numbers: Mapping[str, Any] | None = None,
     ) -> Control[Plan]:
         """Return the input (m,) at the state x, its plan, in ξ, and what to remember.
 
         forecast: as in `solve`, in ξ, with linearize="set-point" only.
+        numbers: of the robot's model, as in `Robot.vary`, in place of the file's, not with
+            "set-point": an estimated payload, for one. To input_reference is added what holds
+            (the first row of) the reference under them.
         """
         x = one_state(self, x)
         require_before(before)
@@ -374,19 +384,42 @@ class RobotController:
         if forecast is not None:
             what = f"given with linearize={self.linearize!r}"
             fail("forecast", what, 'Give linearize="set-point", or leave it out')
+        if numbers:
+            if not self.takes_numbers:
+                what = f"given with linearize={self.linearize!r} of a {type(self.robot).__name__}"
+                fail("numbers", what, 'Give linearize="state" or "trajectory" and a Robot')
+            known["input_reference"] = self._held(reference, input_reference, numbers)
         if self.linearize == "trajectory":
             search = {"iterations": self.sqp_steps, "hessian": self.hessian, "scale": self.scale}
-            return sqp_control(self.problem, self.solver, xi, before, reference, **known, **search)
+            problem = NonlinearMPC(self.soft, as_model(self.robot, self.exact, numbers), self.tasks)
+            return sqp_control(problem, self.solver, xi, before, reference, **known, **search)
         memory = None if before is None else before.memory
         last = last_input(self.soft, before, previous_input)
         rows = layout(self.soft)
         start = None if memory is None else memory.shifted(rows, memory.inputs[-1])
         inputs = at_rest(self.soft, xi, input_reference)[1] if memory is None else memory.inputs
-        system = self.robot.linearize(x, limited(self.soft.inputs, inputs[0]), exact=self.exact)
+        about = limited(self.soft.inputs, inputs[0])
+        with_numbers = (
+            {"numbers": numbers} if numbers else {}
+        )  # which plants of users need not take
+        system = self.robot.linearize(x, about, exact=self.exact, **with_numbers)
         known |= {"previous_input": last, "scale": self.scale}
         mpc = replace(self.soft, system=system)
         plan = solve_stagewise(mpc, xi, reference, self.solver, start, **known)
         return applied(self.soft, rows, plan, memory, last)
+
+    def _held(self, reference: Any, input_reference: Any, numbers: Mapping[str, Any]) -> Any:
+        """Return input_reference plus the input that makes up, at the first row of the reference,
+        for what these numbers change in the next state: least squares, exact where each joint has
+        a motor."""
+        if reference is None or input_reference is None:
+            return input_reference
+        r, s = (first_row(part, self.dtype) for part in (reference, input_reference))
+        r = r[: self.robot.n]
+        file, told = (RobotModel(self.robot, dict(v), exact=False) for v in ({}, numbers))
+        B: Any = told.linearize(r, s).B
+        lost = matmul(B.T, file.step(r, s) - told.step(r, s))
+        return jnp.asarray(input_reference, self.dtype) + solve(ridged(matmul(B.T, B)), lost)
 
     @property
     def problem(self) -> NonlinearMPC:
@@ -399,9 +432,9 @@ class RobotController:
         return reference_sizes(self.problem) if self.tasks else (self.mpc.system.n,)
 
 
-def as_model(robot: Any, exact: bool = True) -> Any:
-    """Return a Robot or LinearPlant as the model of a `NonlinearMPC`."""
-    return RobotModel(robot, exact=exact) if isinstance(robot, Robot) else robot
+def as_model(robot: Any, exact: bool = True, numbers: Mapping[str, Any] | None = None) -> Any:
+    """Return a Robot, with these numbers, or LinearPlant as the model of a `NonlinearMPC`."""
+    return RobotModel(robot, dict(numbers or {}), exact) if isinstance(robot, Robot) else robot
 
 
 # How much more than a violated limit of a state a violated limit of a force costs.

@@ -370,6 +370,9 @@ class Loop:
             state, disturbances = self.state(state), found if len(found) else None
         if getattr(self.controller, "observer", None) is not None:
             told["disturbance"] = disturbances
+        elif observer is not None and observer.estimates_numbers and disturbances is not None:
+            if getattr(self.controller, "takes_numbers", False):
+                told["numbers"] = observer.numbers(disturbances)
         control = self.controller(seen, before, r, **told)
         plan, u = control.plan, previous if self.given.delay else control.u
         record = Run(
@@ -500,7 +503,7 @@ def simulate_many(
     if variations is not None:
         cure = "Give a dict, such as {'mass': masses} with one entry for each loop"
         require_kind("variations", variations, Mapping, cure=cure)
-    variations = dict(variations or {})
+    variations = {name: numpy_array(v) for name, v in dict(variations or {}).items()}
     require_variations(plant, variations, len(x0s))
     chunk = None if chunk is None else whole("chunk", chunk, 1)
     devices = chosen_devices(devices)

@@ -360,9 +360,10 @@ def _without_margins(model: Any) -> dict[str, Any]:
 
 
 def in_force(numbers: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Return numbers, directions among them with length one, as MuJoCo's compiler makes them."""
-    unit = lambda v: jnp.asarray(v) / jnp.linalg.norm(jnp.asarray(v), axis=-1, keepdims=True)
-    given = dict(numbers or {})
+    """Return numbers as arrays, directions among them with length one, as MuJoCo's compiler makes
+    them."""
+    unit = lambda v: v / jnp.linalg.norm(v, axis=-1, keepdims=True)
+    given = {key: jnp.asarray(v) for key, v in (numbers or {}).items()}  # lists too
     return given | {key: unit(v) for key, v in given.items() if key in DIRECTIONS}
 
 

@@ -9,8 +9,8 @@ import scipy
 from c_engine import c_steps
 
 import jaxmpc as jm
-from jaxmpc.closed_loop import KalmanFilter, LinearFeedback, Noise
-from jaxmpc.closed_loop.estimation import _drawn
+from jaxmpc.closed_loop import Disturbance, KalmanFilter, LinearFeedback, Noise
+from jaxmpc.closed_loop.estimation import Belief, _drawn
 
 T, J = 0.1, 0.5
 SYSTEM = jm.LinearSystem(
@@ -307,6 +307,96 @@ def test_derivatives_through_noise_filter_and_delay():
     step = 1e-6 * np.eye(4)
     want = [(value(theta + h) - value(theta - h)) / 2e-6 for h in step]
     np.testing.assert_allclose(slope, want, rtol=1e-5)
+
+
+LOADED = """<mujoco><worldbody><body><joint name="j" axis="0 1 0" damping=".2"/>
+<geom type="capsule" fromto="0 0 0 .4 0 0" size=".02" mass="1"/><site name="tool" pos=".4 0 0"/>
+</body></worldbody><actuator><motor joint="j" ctrlrange="-9 9" gear="2"/></actuator></mujoco>"""
+
+
+@pytest.fixture(scope="module")
+def loaded():
+    return jm.load_robot(mujoco.MjModel.from_xml_string(LOADED), control_period=0.02)
+
+
+def followed(robot, kinds, seed=0, **numbers):
+    """Return what a filter that measures everything estimates of a plant with other numbers, under
+    random inputs, in its last step."""
+    loads = tuple(Disturbance(kind, 1e-6, M, initial=0.5) for kind, M in kinds)
+    observer = KalmanFilter(robot, 1e-7, 1e-6, C=np.eye(2), initial=1e-3, disturbance=loads)
+    observer, plant = observer.prepared(), robot.vary(**numbers)
+    random = np.random.default_rng(seed)
+
+    @jax.jit
+    def step(x, belief, u):
+        belief = observer.corrected(belief, robot.coordinates(x))
+        return plant.step(x, u), observer.predicted(belief, u), belief.mean
+
+    x, belief = np.array([0.3, 0.0]), observer.first(np.array([0.3, 0.0]))
+    for _ in range(60):
+        x, belief, mean = step(x, belief, random.uniform(-2, 2, 1))
+    return observer.split(np.asarray(mean))[1]
+
+
+def test_numbers_of_a_robot_are_estimated(loaded):
+    """A payload, the damping of a joint and the strength of a motor, each alone and together."""
+    gear = np.eye(6, 1)
+    truth = {"payload": 0.7, "dof_damping": [0.5], "actuator_gear": [[2.6, 0, 0, 0, 0, 0]]}
+    changes = {"payload": 0.7, "dof_damping": 0.3, "actuator_gear": 0.6}
+    matrices = {"actuator_gear": gear}
+    for kind, value in truth.items():
+        found = followed(loaded, [(kind, matrices.get(kind))], **{kind: value})
+        np.testing.assert_allclose(found, changes[kind], rtol=1e-3)
+    both = ("payload", "dof_damping")
+    found = followed(loaded, [(kind, None) for kind in both], **{k: truth[k] for k in both})
+    np.testing.assert_allclose(found, [changes[k] for k in both], rtol=1e-3)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("linearize", ["state", "trajectory"])
+def test_plans_know_the_estimated_payload(loaded, linearize):
+    """The rod hangs where its reference is, and is held there: with a load that nobody knows below
+    it, with an estimated one where a controller that knows the load brings it."""
+    target = [1.0]
+    mpc = jm.robot_mpc(loaded, horizon=5, target=target)
+    x, torque = loaded.set_point(target)
+    aims = {"reference": loaded.coordinates(x), "input_reference": torque}
+    controller = jm.RobotController(loaded, mpc, linearize=linearize)
+    known, plant = {"payload": 0.7}, loaded.vary(payload=0.7)
+    load = Disturbance("payload", 1e-4, initial=0.5)
+    errors = []
+    for disturbance in ((), load):
+        observer = KalmanFilter(
+            loaded, 1e-6, 1e-5, C=np.eye(2), initial=1e-3, disturbance=disturbance
+        )
+        run = jm.simulate(controller, plant, [0.8, 0.0], 150, observer=observer, **aims)
+        errors.append(abs(run.states[-1, 0] - 1.0))
+    np.testing.assert_allclose(run.disturbances[-1], 0.7, rtol=1e-3)
+    assert errors[1] < 1e-3 < 0.02 * errors[0]
+    # At the reference the input is what holds the rod with its load there.
+    control = controller(np.array([1.0, 0.0]), None, numbers=known, **aims)
+    x = np.asarray(plant.step(np.array([1.0, 0.0]), control.u))
+    np.testing.assert_allclose(x, [1.0, 0.0], atol=2e-3)
+
+
+@pytest.mark.long
+def test_the_covariance_of_numbers_is_that_of_the_linear_model(loaded):
+    """By differences of the prediction, about numbers that are not the file's."""
+    model = jm.robots.RobotModel(loaded, numbers={"payload": 0.2})
+    problem = jm.mpc.NonlinearMPC(jm.robot_mpc(loaded, horizon=2), model)
+    load = Disturbance("payload", 0.01, [[2.0]], initial=0.3)
+    observer = KalmanFilter(problem, 0.0, 1e-3, initial=0.1, disturbance=load).prepared()
+    mean, u = jnp.array([0.3, -0.4, 0.15]), jnp.array([0.7])
+    P = jnp.diag(jnp.array([0.02, 0.01, 0.09]))
+    after = lambda mean: observer.predicted(Belief(mean, P), u).mean
+    step = 1e-6
+    F = np.stack(
+        [(after(mean + step * e) - after(mean - step * e)) / (2 * step) for e in np.eye(3)]
+    )
+    found = observer.predicted(Belief(mean, P), u).covariance
+    np.testing.assert_allclose(found, F.T @ P @ F + np.diag([0, 0, 1e-4]), atol=1e-9)
+    heavier = jm.robots.RobotModel(loaded, numbers={"payload": 0.2 + 2 * 0.15})
+    np.testing.assert_allclose(after(mean)[:2], heavier.step(mean[:2], u), atol=1e-12)
 
 
 def test_not_finite_stays_in_its_row(gaussian):

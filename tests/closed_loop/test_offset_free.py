@@ -421,6 +421,7 @@ def test_bad_arguments_are_named(controller):
     ball = replace(MPC, terminal_set=jm.Ellipsoid(np.eye(3), 1.0))
     for call, message in (
         (lambda: load("force", 1.0), r"observer.disturbance\[0\].kind: 'force'. Give one of input"),
+        (lambda: load("payload", 1.0), r"'payload'. Give .* with a Robot as the model also its"),
         (lambda: load("input", 0.0), r"disturbance\[0\].process: leaves a disturbance without"),
         (lambda: load("input", None), r"disturbance\[0\].process: is None"),
         (lambda: load("input", [1.0] * 3), r"disturbance\[0\].process: shape \(3,\)"),

@@ -9,7 +9,7 @@ import pytest
 from c_engine import c_steps
 
 import jaxmpc as jm
-from jaxmpc.closed_loop import randomised
+from jaxmpc.closed_loop import LinearFeedback, randomised
 from jaxmpc.closed_loop.simulation import require_variations
 from jaxmpc.robots import RobotModel, tasks
 from jaxmpc.robots.parameters import FIELDS
@@ -212,6 +212,22 @@ def test_variations_of_a_robot_that_was_varied(motor):
     same = randomised(heavy, 2, mass=(1.0, 1.0))
     for name, value in same.items():
         np.testing.assert_array_equal(value[1], heavy.numbers[name])
+
+
+def test_lists_are_arrays(motor):
+    """Of a plant that varies, of a model's numbers, and of many loops."""
+    damping, x, u = [0.3, 0.2], np.array([0.1, 0.2, 0.3, 0.4]), np.ones(1)
+    step = lambda values: motor.vary(dof_damping=values).step(x, u)
+    np.testing.assert_array_equal(step(damping), step(np.array(damping)))
+    linear = lambda values: motor.linearize(x, u, numbers={"dof_damping": values}).A
+    np.testing.assert_array_equal(linear(damping), linear(np.array(damping)))
+    controller = LinearFeedback(
+        jm.robot_mpc(motor, horizon=1, terminal_cost=None), np.zeros((1, 4)), motor
+    )
+    many = lambda of: jm.simulate_many(
+        controller, motor, np.stack([x, x]), 2, variations={"dof_damping": of([damping] * 2)}
+    )
+    np.testing.assert_array_equal(many(list).states, many(np.array).states)
 
 
 def test_what_does_nothing_is_refused(motor):
