@@ -1,6 +1,7 @@
 """Numbers in arguments of public functions: their type, and arrays made of them."""
 
 from collections.abc import Sequence
+from fractions import Fraction
 from numbers import Real
 from typing import TYPE_CHECKING, Any, NewType, TypeAlias
 
@@ -30,6 +31,11 @@ def host_array(argument: str, value: Any, *, copy: bool = True) -> np.ndarray:
     value = of_known_type(value)
     require_real(argument, value)
     return np.asarray(value).astype(np.float64, copy=copy)
+
+
+def fractions_of(values: Any) -> np.ndarray:
+    """Return an array of Fractions, each exactly the float it comes from."""
+    return np.asarray(np.frompyfunc(Fraction, 1, 1)(np.asarray(values, np.float64)), object)
 
 
 def dimensions(value: Any) -> int | None:

@@ -12,7 +12,7 @@ import os
 import tempfile
 import uuid
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -179,11 +179,16 @@ def remove_partial(path: Path) -> None:
         left.unlink(missing_ok=True)
 
 
+def side_path(path: Path) -> Path:
+    """Return a new name beside a path; what lies there is a leftover once its process has ended."""
+    return path.with_name(f".{path.name}.{uuid.uuid4().hex}")
+
+
 @contextlib.contextmanager
 def _replacing(path: Path) -> Iterator[BinaryIO]:
     """Yield a temporary file that replaces `path` once it is written; remove it after an error."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    side = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
+    side = side_path(path)
     try:
         with open(side, "xb") as file:
             yield file
@@ -204,6 +209,14 @@ def check_results(
     if exists and not (resume or overwrite):
         cure = "Add --resume (resume=True) to go on, or --overwrite (overwrite=True) to start again"
         fail(str(path), "exists", cure)
+
+
+def require_new(paths: Sequence[Path], overwrite: bool) -> None:
+    """Raise ValueError where one of these files exists, unless it is to be overwritten."""
+    for path in paths:
+        if path.exists() and not overwrite:
+            cure = "Overwrite it (overwrite=True, --overwrite) or give another folder or name"
+            fail(str(path), "exists", cure)
 
 
 def open_folder(path: Path) -> None:

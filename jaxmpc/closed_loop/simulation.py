@@ -15,7 +15,6 @@ from jaxmpc.arrays import Reals, numpy_array
 from jaxmpc.batches import (
     Compiled,
     Devices,
-    Part,
     chosen_devices,
     count,
     device_bytes,
@@ -531,10 +530,7 @@ def simulate_many(
             break
         size = divisible(-(-size // 2), devices)
     runs = list[Run]()
-
-    def keep(part: Part[Run]) -> None:
-        runs.append(part.result)
-
+    keep = lambda part: runs.append(part.result)
     work_off(each_part(run, each, size), keep, len(x0s), unit="loops", progress=progress)
     return joined(runs)
 

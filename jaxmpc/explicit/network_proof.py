@@ -18,6 +18,7 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.arrays import host_array
+from jaxmpc.batches import each_part, joined
 from jaxmpc.checks import fail, require_finite, require_kind, require_shape, whole
 from jaxmpc.pytrees import record
 from jaxmpc.sets.convex_sets import Box
@@ -117,10 +118,8 @@ def prove_network(
         bounds = jax.jit(jax.vmap(excess_bounds, (None, 0)))
         whole_volume, kept, broken, count = float(simplex_volumes(left).sum()), 0.0, 0.0, 0
         while len(left) and count + len(left) <= cells:
-            room = -len(left) % PART
-            padded = np.concatenate([left, np.repeat(left[:1], room, axis=0)])
-            parts = [bounds(network64, padded[i : i + PART]) for i in range(0, len(padded), PART)]
-            least, most = (np.concatenate(v)[: len(left)] for v in zip(*parts, strict=True))
+            parts = each_part(lambda part: bounds(network64, part), left, PART)
+            least, most = joined([part.result for part in parts])
             count += len(left)
             volume, proved, refuted = simplex_volumes(left), most <= -margin, least >= margin
             kept += float(volume[proved].sum())

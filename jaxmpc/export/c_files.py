@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from jaxmpc.checks import fail, number
-from jaxmpc.files import versions
+from jaxmpc.files import open_folder, require_new, versions
 from jaxmpc.mpc.plan import rate_ends
 from jaxmpc.mpc.problem import MPC, at_stage
 from jaxmpc.pytrees import record
@@ -103,14 +103,8 @@ def prepared_paths(folder: Path, names: list[str], overwrite: bool) -> list[Path
     """Return the paths of the files in the folder, which is made; raise ValueError where one exists
     and may not be overwritten."""
     paths = [folder / name for name in names]
-    for path in paths:
-        if path.exists() and not overwrite:
-            cure = "Overwrite it (overwrite=True, --overwrite) or give another folder or name"
-            fail(str(path), "exists", cure)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        fail(str(folder), f"{error.strerror}", "Give a folder that you can write")
+    require_new(paths, overwrite)
+    open_folder(folder)
     return paths
 
 

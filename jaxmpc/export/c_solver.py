@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmpc.arrays import Reals, host_array
+from jaxmpc.batches import each_part, joined
 from jaxmpc.checks import (
     fail,
     number,
@@ -29,7 +30,6 @@ from jaxmpc.mpc.plan import Plan, WarmStart
 from jaxmpc.mpc.policy_rows import PolicyCondensed
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.admm import ADMM
-from jaxmpc.qp.linalg import matmul
 from jaxmpc.qp.status import Status
 
 # Relative residuals below which the code says "solved".
@@ -80,7 +80,6 @@ def export_c(
         if controller.condensed.K.ndim == 3:  # a plan is shifted in the variables of one gain
             mpc = replace(mpc, prestabilise=False)
             controller = Controller(mpc, controller.solver)
-        assert controller.factor is not None
         fault = Status(int(controller.factor.fault))
         if fault != Status.NOT_RUN:
             fail("mpc", f"cannot be factored: {fault.name}", "See the status in jm.Status")
@@ -96,7 +95,6 @@ def export_c(
 def _sizes(controller: Controller) -> dict[str, Any]:
     """What the code needs to know before it is compiled."""
     mpc, c, factor = controller.mpc, controller.condensed, controller.factor
-    assert c is not None and factor is not None
     return {
         "STATES": mpc.system.n,
         "INPUTS": mpc.system.m,
@@ -117,7 +115,6 @@ def _sizes(controller: Controller) -> dict[str, Any]:
 def _tables(controller: Controller) -> dict[str, Any]:
     """Every table of `mpc.c` by its name, in float64 and int."""
     mpc, c = controller.mpc, controller.condensed
-    assert c is not None
     tables = jax.tree.map(np.asarray, _computed(controller)) | input_limits(mpc)
     tables["row_size"], tables["variable_size"] = jax.tree.map(
         np.asarray, sizes_of_code(controller)
@@ -144,7 +141,6 @@ def sizes_of_code(controller: Controller) -> tuple[jax.Array, jax.Array]:
     plan of how far these bounds are is the size of the variables, and of rows without one.
     """
     c, factor = controller.condensed, controller.factor
-    assert c is not None and factor is not None
     ends = jnp.abs(jnp.stack([c.lower, c.upper]))
     nearest = jnp.min(jnp.where((ends > 0) & jnp.isfinite(ends), ends, jnp.inf), axis=0)
     far = jnp.where(jnp.isfinite(nearest) & (factor.E > 0), nearest * factor.E, jnp.nan)
@@ -160,7 +156,6 @@ def sizes_of_code(controller: Controller) -> tuple[jax.Array, jax.Array]:
 def _computed(controller: Controller) -> dict[str, Any]:
     """The tables of the program and its factorization."""
     mpc, c, factor = controller.mpc, controller.condensed, controller.factor
-    assert c is not None and factor is not None
     N, n, m = mpc.horizon, mpc.system.n, mpc.system.m
     origin, T = jnp.zeros(mpc.dimension), factor.T
 
@@ -207,7 +202,6 @@ def _of_starts(controller: Controller) -> dict[str, Any]:
     later_row: number of the row of the last plan, from 1, whose multiplier each row begins with, 0
     for none: what `Controller.shifted` does to multipliers that are the numbers of their rows."""
     mpc, c = controller.mpc, controller.condensed
-    assert c is not None
     N, n, m = mpc.horizon, mpc.system.n, mpc.system.m
     numbers = jnp.arange(1.0, c.C.shape[0] + 1)
     states, inputs = jnp.zeros((N + 1, n)), jnp.zeros((N, m))
@@ -295,15 +289,9 @@ def _controls(controller: Controller, states: Any, before: Any, target: Target) 
 def _precise_plans(
     controller: Controller, states: np.ndarray, before: np.ndarray, target: Target
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return `_controls` in parts of one shape, the last one filled up with its last state."""
-    parts = []
-    for i in range(0, len(states), DRAWN):
-        part = np.arange(i, i + DRAWN).clip(max=len(states) - 1)
-        parts.append(_controls(controller, states[part], before[part], target))
-    u, status = (
-        np.concatenate([np.asarray(v) for v in column]) for column in zip(*parts, strict=True)
-    )
-    return u[: len(states)], status[: len(states)]
+    """Return `_controls` in parts of one shape."""
+    program = lambda rows: _controls(controller, *rows, target)
+    return joined([part.result for part in each_part(program, (states, before), DRAWN)])
 
 
 def starting_states(
@@ -353,15 +341,12 @@ def check_fixed_steps(
         precise = Controller(mpc, ADMM())
         target = target_of(mpc, reference, input_reference)
         starts = starting_states(precise, lower, upper, seed, target)
-        A, B = (jnp.asarray(host_array("system", v)) for v in (mpc.system.A, mpc.system.B))
-        drift = 0.0 if mpc.system.c is None else jnp.asarray(host_array("system.c", mpc.system.c))
 
         def step(state: Any, _: Any) -> Any:
             x, before = state
             control = fixed(x, before, target[0], input_reference=target[1])
-            after = matmul(A, x) + matmul(B, control.u) + drift
             solved = solved_by_code(fixed, control.plan, tolerance)
-            return (after, control), (x, before.u, control.u, solved)
+            return (mpc.system.step(x, control.u), control), (x, before.u, control.u, solved)
 
         def loop(x: Any) -> Any:
             return jax.lax.scan(step, (x, fixed.start(x)), length=-(-plans // LOOPS))[1]

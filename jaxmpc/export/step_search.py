@@ -6,8 +6,6 @@ states; all values of a penalty are tried in one batch. The number of steps is d
 suffices.
 """
 
-import sys
-import time
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -32,6 +30,7 @@ from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.policy_rows import PolicyCondensed
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.admm import ADMM
+from jaxmpc.recursion.time_budget import Budget
 
 # Factors by which a penalty is moved at once, and how often each is.
 FACTORS = 2.0 ** np.array([0.0, -2, -1, -0.5, 0.5, 1, 2])
@@ -91,12 +90,7 @@ def choose_steps(
         if isinstance(precise.condensed, PolicyCondensed):
             kinds, alpha = np.zeros(len(rho), int), ALPHA_OF_POLICIES
         steps = FEWEST if iterations is None else iterations
-        begun = time.monotonic()
-
-        def say(what: str) -> None:
-            if progress:
-                print(f"{time.monotonic() - begun:6.1f} s  {what}", file=sys.stderr, flush=True)
-
+        say = Budget.of(np.inf, progress).say
         while True:
             say(f"{steps:,} iterations")
             make = lambda rho, steps=steps: Controller(

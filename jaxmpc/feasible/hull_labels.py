@@ -22,7 +22,6 @@ rolled out at once, and is else left to the other stages.
 
 import functools
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import jax
 import jax.numpy as jnp
@@ -184,18 +183,14 @@ def vertex_values(
     return np.hstack([inputs.reshape(len(w), -1), variables[:, variables.shape[1] - free :]])
 
 
-# The hulls of problems that have been asked for, for as long as the problems live.
-_made: WeakKeyDictionary[FeasibilityProblem, Hull | None] = WeakKeyDictionary()
-
-
 def hull_for(problem: FeasibilityProblem, points: float) -> Hull | None:
     """Return the hull of a problem if so many points are worth the rays, or if they were made for
     it before; None else, and where it has none."""
     many = MANY if default_platform() == "cpu" else MANY_ELSEWHERE
     least = many * 4.0 ** (problem.dimension - 2)
-    if problem not in _made and points >= least:
-        _made[problem] = Hull.of(problem)
-    return _made.get(problem)
+    if "hull" not in problem.memory and points >= least:
+        problem.memory["hull"] = Hull.of(problem)
+    return problem.memory.get("hull")
 
 
 @functools.cache

@@ -14,7 +14,6 @@ import math
 import time
 from dataclasses import replace
 from typing import Any, NamedTuple
-from weakref import WeakKeyDictionary
 
 import jax
 import jax.numpy as jnp
@@ -311,14 +310,11 @@ def compiled_policy_labels(devices: Devices) -> Compiled:
     return over_devices(jax.vmap(one, in_axes=(None, 0)), devices, (False, True))
 
 
-_made: WeakKeyDictionary[PolicyProblem, PolicyHull] = WeakKeyDictionary()
-
-
 def policy_hull(problem: PolicyProblem) -> PolicyHull:
     """Return the hull of a problem, made once."""
-    if problem not in _made:
-        _made[problem] = PolicyHull.of(problem)
-    return _made[problem]
+    if "hull" not in problem.memory:
+        problem.memory["hull"] = PolicyHull.of(problem)
+    return problem.memory["hull"]
 
 
 class AffinePolicies(NamedTuple):

@@ -32,7 +32,7 @@ from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 
-from jaxmpc.arrays import Reals
+from jaxmpc.arrays import Reals, fractions_of
 from jaxmpc.checks import fail, require_kind
 from jaxmpc.feasible.hard_constraints import Axes, augmented_dynamics, hard_blocks, make_view
 from jaxmpc.feasible.plan_polytope import PlanPolytope
@@ -206,22 +206,17 @@ def generators(W: Any) -> tuple[np.ndarray, np.ndarray]:
     """Return center (p,) and Γ (p, g) of w = center + Γ ω, |ω_i| ≤ 1, in fractions, of a Box or a
     Zonotope."""
     if isinstance(W, Box):
-        lower, upper = exactly(W.lower), exactly(W.upper)
+        lower, upper = fractions_of(W.lower), fractions_of(W.upper)
         half = (upper - lower) / 2
         return (lower + upper) / 2, np.diag(half)[:, half > 0]
-    return exactly(W.center), exactly(W.generators)
-
-
-def exactly(values: Any) -> np.ndarray:
-    """Return an array of Fractions, each exactly the float it comes from."""
-    return np.asarray(np.frompyfunc(Fraction, 1, 1)(np.asarray(values, np.float64)), object)
+    return fractions_of(W.center), fractions_of(W.generators)
 
 
 def affine_fractions(mpc: MPC, view: Any) -> PolicyRows:
     """Return the rows under affine policies, over θ, v and ω, all products of the data exact."""
     n, m, moves = mpc.system.n, mpc.system.m, mpc.moves
     center, gamma = directions(mpc)
-    E = exactly(disturbance_columns(mpc.disturbance_matrix, n))
+    E = fractions_of(disturbance_columns(mpc.disturbance_matrix, n))
     p = condensed_fractions(mpc, view, E @ center, E @ gamma)
     if mpc.control_horizon is None:
         return p
@@ -238,8 +233,8 @@ def tube_fractions(mpc: MPC, view: Any) -> PolicyRows:
     that of the input that is applied."""
     n, m, N = mpc.system.n, mpc.system.m, mpc.horizon
     gain, section = np.asarray(feedback_gain(mpc), float), tube_section(mpc)
-    center, sides = exactly(section.center), exactly(section.generators)
-    count, K = sides.shape[1], exactly(gain)
+    center, sides = fractions_of(section.center), fractions_of(section.generators)
+    count, K = sides.shape[1], fractions_of(gain)
     nominal = condensed_fractions(mpc, view, 0 * center, zeros(n, 0))
     # z_0 = θ − center − G ζ: what an initial state adds to each row, without the view.
     whole = condensed_fractions(mpc, make_view(mpc), 0 * center, zeros(n, 0)).F
@@ -283,12 +278,12 @@ def _taken_of_tube(
     n, N = mpc.system.n, mpc.horizon
     if b.kind == "previous input" or (b.rate and k == 0):
         return [(Fraction(0), Fraction(0))] * b.size
-    along = exactly(b.H)[:, :n] + (exactly(b.D) @ K if k < N else 0)
+    along = fractions_of(b.H)[:, :n] + (fractions_of(b.D) @ K if k < N else 0)
     middle, half = zeros(b.size), zeros(b.size)
     if b.rate:
-        A, B, _ = map(exactly, host_matrices(mpc.system))
+        A, B, _ = map(fractions_of, host_matrices(mpc.system))
         mid, gamma = generators(mpc.disturbance)
-        push = along @ exactly(disturbance_columns(mpc.disturbance_matrix, n))
+        push = along @ fractions_of(disturbance_columns(mpc.disturbance_matrix, n))
         middle, half = push @ mid, abs(push @ gamma).sum(axis=1)
         along = along @ (A + B @ K) - along
     middle = middle + along @ center
@@ -306,7 +301,7 @@ def condensed_fractions(mpc: MPC, view: Any, drift: np.ndarray, push: np.ndarray
     given; x stands for (x, u_{−1}) where rates are limited."""
     N, m, g = mpc.horizon, mpc.system.m, push.shape[1]
     n = mpc.dimension
-    A, B, c = map(exactly, augmented_dynamics(mpc))
+    A, B, c = map(fractions_of, augmented_dynamics(mpc))
     more = n - len(drift)
     c = c + np.append(drift, zeros(more))
     push = np.vstack([push, zeros(more, g)])
@@ -326,7 +321,7 @@ def condensed_fractions(mpc: MPC, view: Any, drift: np.ndarray, push: np.ndarray
     lower: list[Fraction | None] = []
     upper: list[Fraction | None] = []
     for b in hard_blocks(without_disturbance(mpc)):
-        H, D_u = exactly(b.H), exactly(b.D)
+        H, D_u = fractions_of(b.H), fractions_of(b.D)
         for k in b.steps:
             F, G, D, f = (H @ part for part in states[k])
             if k < N:
@@ -341,7 +336,7 @@ def condensed_fractions(mpc: MPC, view: Any, drift: np.ndarray, push: np.ndarray
                 upper.append(Fraction(high) - f[i] if np.isfinite(high) else None)
     F, G, D = (np.array(v, object).reshape(len(lower), -1) for v in (F_rows, G_rows, D_rows))
     box: Any = mpc.inputs
-    ends = [np.tile(exactly(end), N) for end in (box.lower, box.upper)]
+    ends = [np.tile(fractions_of(end), N) for end in (box.lower, box.upper)]
     first = np.eye(m, N * m), np.zeros(m)
     D = D.reshape(len(lower), N * g)
     least, most = ends

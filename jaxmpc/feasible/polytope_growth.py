@@ -22,6 +22,7 @@ from jaxmpc.mpc.plan import rate_ends
 from jaxmpc.mpc.problem import HARD, MPC, RELAX
 from jaxmpc.pytrees import record
 from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope
+from jaxmpc.sets.disturbances import disturbance_columns
 from jaxmpc.sets.geometry import Empty, unit_rows
 from jaxmpc.sets.predecessors import predecessor
 from jaxmpc.systems.system import LinearSystem
@@ -137,8 +138,7 @@ def _any_policy_of_rates(mpc: MPC) -> Polytope:
     free = not len(np.asarray(body.h))
     E = None
     if mpc.disturbance is not None:
-        given = np.eye(n) if mpc.disturbance_matrix is None else mpc.disturbance_matrix
-        E = of_x.T @ np.asarray(given, float)
+        E = of_x.T @ disturbance_columns(mpc.disturbance_matrix, n)
     changes = Box(*(np.broadcast_to(np.asarray(v, float), (m,)) for v in rate_ends(mpc)))
     for k in range(mpc.horizon):
         if k == 0 and free:

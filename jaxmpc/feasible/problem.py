@@ -5,7 +5,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.linalg import qr
 
 from jaxmpc.arrays import Reals
 from jaxmpc.checks import require_kind, require_untraced
@@ -23,7 +22,8 @@ from jaxmpc.pytrees import record
 from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope, set_bounds
 from jaxmpc.sets.disturbances import disturbance_columns, with_vertices
 from jaxmpc.sets.geometry import binding_rows, implied_equalities, unit_rows
-from jaxmpc.sets.lp import FLAT, ROUNDING, scaling
+from jaxmpc.sets.lp import ROUNDING
+from jaxmpc.sets.polyhedra import independent
 
 
 @record
@@ -262,14 +262,6 @@ def with_equalities(mpc: MPC) -> MPC:
         outputs.append(Outputs(C, lower, h[rows], D, stages, labels))
         changes[name] = Box(*set_bounds(set_, size))
     return replace(mpc, outputs=tuple(outputs), **changes) if changes else mpc
-
-
-def independent(H: np.ndarray, h: np.ndarray) -> np.ndarray:
-    """Return the indices of as many rows of H as are independent, in scaled columns."""
-    row, column = scaling(H, h)
-    _, R, order = qr((row[:, None] * H * column).T, mode="economic", pivoting=True)
-    size = np.abs(np.diag(R))
-    return np.sort(order[: int((size > FLAT * size[0]).sum())])
 
 
 def as_box(set_: Any) -> Any:

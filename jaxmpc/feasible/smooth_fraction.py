@@ -103,7 +103,7 @@ def _membership(c: Condensed, x0s: Array, width: Array, scale: Any, steps: int) 
     size, tight = _tightened(c, width, None if scale is None else scale.astype(dtype))
     C, D = c.C / size[:, None], c.D / size[:, None]
 
-    def at(C: Array, D: Array, tight: Bounds, x0: Array) -> Bounds:
+    def at(D: Array, tight: Bounds, x0: Array) -> Bounds:
         shift = matmul(D, x0) + c.d / size
         return replace(tight, l=tight.l - shift, u=tight.u - shift)
 
@@ -117,7 +117,7 @@ def _membership(c: Condensed, x0s: Array, width: Array, scale: Any, steps: int) 
         # derivative takes it for a constant; the second follows it.
         given = jnp.all(jnp.isfinite(x0))
         x0 = jnp.where(given, x0, 0.0)
-        fixed, bounds = jax.lax.stop_gradient((C, at(C, D, tight, x0)))
+        fixed, bounds = jax.lax.stop_gradient((C, at(D, tight, x0)))
         z = linalg.solve(normal, matmul(jnp.where(both, bounds.l + bounds.u, 0) / 2, centred))
         z, e = nearest_point(fixed, bounds, z, steps)
         usable = given & jnp.isfinite(jnp.sum(e**2) / width**4) & jnp.all(jnp.isfinite(z))
@@ -125,7 +125,7 @@ def _membership(c: Condensed, x0s: Array, width: Array, scale: Any, steps: int) 
         weights, normals = bounds.curvature(matmul(z, fixed.T), 1.0)
 
         def distance(z: Array) -> Array:
-            e = at(C, D, tight, x0).prox_residual(matmul(z, C.T), 1.0)
+            e = at(D, tight, x0).prox_residual(matmul(z, C.T), 1.0)
             # A row that the minimiser just touches is one that it keeps, in all derivatives.
             return jnp.where(weights > 0, e, jax.lax.stop_gradient(e))
 

@@ -265,9 +265,7 @@ class Batch:
 
 def numbers_held(controller: Controller) -> int:
     """Return about how many numbers a program holds of each plan: vectors of rows and inputs."""
-    c, mpc = controller.condensed, controller.mpc
-    size = sum(c.C.shape) if c is not None else mpc.horizon * (mpc.system.n + mpc.system.m)
-    return 16 * size
+    return 16 * sum(controller.condensed.C.shape)
 
 
 def places(where: np.ndarray) -> np.ndarray | slice:

@@ -354,15 +354,10 @@ def applied(
 
 
 def cost(
-    mpc: MPC,
-    states: Array,
-    inputs: Array,
-    aim: Aim,
-    violations: list[tuple[Block, Array]] | None = None,
+    mpc: MPC, states: Array, inputs: Array, aim: Aim, violations: list[tuple[Block, Array]]
 ) -> Array:
     """Return J (without ½) of a trajectory, states (N+1, n) and inputs (N, m), with what input
-    rates and soft rows add. violations: of soft blocks, None: those of the trajectory."""
-    violations = _violations(mpc, states, inputs) if violations is None else violations
+    rates and these violations of soft blocks add."""
     error = states if aim.states is None else states - aim.states
     effort = inputs if aim.inputs is None else inputs - aim.inputs
     square = lambda v, W: jnp.sum(v * apply(W, v))
@@ -377,12 +372,6 @@ def cost(
     for block, e in violations:
         J = J + jnp.sum(e * (block.linear + 0.5 * block.quadratic * e))
     return J
-
-
-def slack(mpc: MPC, states: Array, inputs: Array) -> Array:
-    """Return the violation of the p soft rows along a trajectory: (N+1, p), zero at stages where
-    a row does not hold."""
-    return _slack(_violations(mpc, states, inputs), states)
 
 
 def _slack(violations: list[tuple[Block, Array]], states: Array) -> Array:

@@ -279,13 +279,13 @@ def damped_kernel(S: Array, W: Array, Lambda: Array, b: Array, damping: float, s
     y, done = jnp.zeros_like(b), 0
     for side in sides(rows):
         here = jnp.where((count > done) & (count <= side), count, 0)
-        solution = _damped(m, min(rows, side), side, damping, steps, b.dtype)
+        solution = _damped(min(rows, side), side, damping, steps, b.dtype)
         part = solution(here[None], S, W, Lambda, b)
         y, done = jnp.where(here > 0, part, y), side
     return y
 
 
-def _damped(m: int, rows: int, side: int, damping: float, steps: int, dtype: jnp.dtype) -> Callable:
+def _damped(rows: int, side: int, damping: float, steps: int, dtype: jnp.dtype) -> Callable:
     """Return the kernel (count (1,), S, W, Lambda, b) → y (k,) with systems of `rows` rows at most,
     in arrays of `side`; y is zero where the count is."""
 

@@ -239,16 +239,13 @@ def _bracket(
     return step
 
 
-def least_distance(
-    A: Array, bounds: Bounds, w: Array, steps: int, damping: float = 0.0
-) -> tuple[Array, Array]:
+def least_distance(A: Array, bounds: Bounds, w: Array, steps: int) -> tuple[Array, Array]:
     """Minimise ½ dist²(A w, set) from w (n,); return w and e = A w − its projection.
 
     e = 0: w satisfies the rows. A'e = 0 with e ≠ 0: no w does, and e is the Farkas vector.
-    damping: as in `Augmented.distance`.
     """
     bounds = bounds.hard()
-    phi = Augmented.distance(bounds, w, damping)
+    phi = Augmented.distance(bounds, w, 0.0)
 
     def body(carry: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
         step = newton_step(carry[0], phi, A)

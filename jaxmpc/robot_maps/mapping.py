@@ -25,6 +25,7 @@ from jaxmpc.pytrees import record
 from jaxmpc.recursion.analysis import examine
 from jaxmpc.recursion.time_budget import Budget
 from jaxmpc.robot_maps.robot_map import CLAIMS, RobotLoops, RobotMap
+from jaxmpc.robots.description import host_coordinates
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.robot import Robot
 from jaxmpc.sets.convex_sets import Box, translated
@@ -139,11 +140,9 @@ class RobotSetting:
         if not number or not 0 < seconds < math.inf:
             fail("seconds", f"{seconds!r}", "Give a positive number")
         x, u = robot.equilibrium() if target is None else robot.set_point(target)
-        with jax.enable_x64(True):
-            reference = np.asarray(robot.coordinates(np.asarray(x)), np.float64)
         limited = with_initial_limits(mpc, robot.state_limits)
         if axes is not None and fixed is None and len(set(axes)) < robot.n:
-            fixed = home_coordinates(robot)
+            fixed = host_coordinates(robot, robot.home)
         if fixed is not None:
             require_shape("fixed", fixed, (robot.n,), "One value a coordinate")
         problem = FeasibilityProblem.of(limited, axes, fixed)
@@ -161,7 +160,7 @@ class RobotSetting:
             problem=problem,
             controller=controller,
             x0s=x0s,
-            reference=reference,
+            reference=host_coordinates(robot, x),
             input_reference=np.asarray(u),
             steps=max(1, round(seconds / robot.dt)),
             claim=claim,
@@ -241,19 +240,13 @@ class RobotSetting:
         return deviations(self.mpc, self.reference, self.input_reference)
 
 
-def home_coordinates(robot: Robot | LinearPlant) -> np.ndarray:
-    """Return the coordinates ξ (n,) of `robot.home`, in float64."""
-    with jax.enable_x64(True):
-        return np.array(robot.coordinates(np.asarray(robot.home)), np.float64)
-
-
 def mpc_with_terminal(robot: Robot, horizon: int, terminal: str) -> MPC:
     """Return `robot_mpc(robot)` with the terminal set "none", "box" or "invariant" about home."""
     mpc = robot_mpc(robot, horizon=horizon)
     if terminal != "invariant":
         found = named_terminal_set(terminal, mpc.system, None, mpc.states, None)
         return replace(mpc, terminal_set=found)
-    x, (_, u) = home_coordinates(robot), robot.equilibrium()
+    x, (_, u) = host_coordinates(robot, robot.home), robot.equilibrium()
     about = deviations(mpc, x, u)
     # At the set-point c is rounding.
     system = replace(about.system, c=None)

@@ -30,8 +30,9 @@ from jaxmpc.files import (
 from jaxmpc.grids import axis_indices, grid_ends, mesh
 from jaxmpc.qp.status import Status
 from jaxmpc.recursion.time_budget import Budget
-from jaxmpc.robot_maps.mapping import RobotSetting, home_coordinates, mpc_with_terminal
+from jaxmpc.robot_maps.mapping import RobotSetting, mpc_with_terminal
 from jaxmpc.robot_maps.robot_map import RobotLoops, RobotMap
+from jaxmpc.robots.description import host_coordinates
 from jaxmpc.robots.load import load_robot, model_hash
 from jaxmpc.robots.robot import Robot
 from jaxmpc.store import BlockWriter, Field, Store, report_damage
@@ -160,7 +161,7 @@ def problem_again(config: Mapping[str, Any], x0s: np.ndarray) -> FeasibilityProb
 
 def _setting(robot: Robot, config: Mapping[str, Any], x0s: np.ndarray) -> RobotSetting:
     """Return what a configuration describes, for points (B, d)."""
-    names, fixed = robot.state_names, home_coordinates(robot)
+    names, fixed = robot.state_names, host_coordinates(robot, robot.home).copy()
     for name, value in config["fixed"].items():
         fixed[names.index(name)] = value
     return RobotSetting.of(
@@ -179,7 +180,8 @@ def _fixed_coordinates(
 ) -> dict[str, float]:
     """Return the values of the coordinates that are not on an axis by name; None: those of home."""
     others = [i for i in range(robot.n) if i not in axes]
-    values = home_coordinates(robot)[others] if fixed is None else host_array("fixed", fixed)
+    home = host_coordinates(robot, robot.home)
+    values = home[others] if fixed is None else host_array("fixed", fixed)
     if values.shape != (len(others),):
         what = f"has {values.size} entries where {len(others)} are needed"
         fail("fixed", what, "One for each coordinate that is not on an axis")

@@ -291,8 +291,7 @@ def require_rest(
     file.opt.disableflags |= flag("clampctrl")
     file.actuator_forcelimited[:] = plant.actuator_forcelimited
     file.jnt_actfrclimited[:] = plant.jnt_actfrclimited
-    if hasattr(file, "actuator_delay"):
-        file.actuator_delay[:] = 0  # inputs at rest are old enough
+    file.actuator_delay[:] = 0  # inputs at rest are old enough
     limited, single = file.jnt_limited.copy(), single_joints(file)
     at, dof = file.jnt_qposadr[single], file.jnt_dofadr[single]
     low, high = (end[dof] for end in robot.state_limits.bounds())

@@ -50,9 +50,9 @@ def point(value: Any) -> Interval:
     return Interval(value, value)
 
 
-def outward(lower: np.ndarray, upper: np.ndarray, unit: float = UNIT) -> Interval:
+def outward(lower: np.ndarray, upper: np.ndarray) -> Interval:
     """Return the interval widened by what one rounding may have changed; 0 is exact."""
-    return Interval(lower - np.abs(lower) * unit, upper + np.abs(upper) * unit)
+    return Interval(lower - np.abs(lower) * UNIT, upper + np.abs(upper) * UNIT)
 
 
 def add(a: Interval, b: Interval) -> Interval:

@@ -142,7 +142,7 @@ def load_robot(
     input_names = tuple(named(host, "actuator", "u"))
     _warn_of_limits(name, [*labels, *input_names], [*sources, *input_sources])
     idle, without, unlike = compared(given, plant, missing, inputs, start)
-    _warn_of_differences(name, host, without, unlike, file.lost)
+    _warn_of_differences(name, without, unlike, file.lost)
     notes = {
         "cleared": [*cleared, *(f"{text}, without effect" for text in idle)],
         "left out": [*["all contacts"] * (not contacts), *file.lost, *without, *unlike],
@@ -279,11 +279,7 @@ def _warn_of_limits(name: str, labels: Sequence[str], sources: Sequence[str]) ->
 
 
 def _warn_of_differences(
-    name: str,
-    host: "mujoco.MjModel",
-    without: list[str],
-    unlike: tuple[str, ...],
-    lost: tuple[str, ...],
+    name: str, without: list[str], unlike: tuple[str, ...], lost: tuple[str, ...]
 ) -> None:
     """Warn where the plant moves otherwise than its file, or linear models otherwise than it."""
     texts = [f"lacks {'; '.join(lost)}"] if lost else []

@@ -74,7 +74,7 @@ class Physics:
         self.constraints = len(blank._impl.efc_J)
         self.rows = self.constraints > 0
         placed = blank._impl.contact.dim.size or np.any(model.eq_type != EQUALITY_OF_JOINTS)
-        light = getattr(model, "flg_gravcomp", False) or np.any(model.body_gravcomp)
+        light = model.flg_gravcomp or np.any(model.body_gravcomp)
         in_fluid = model.opt.density or model.opt.viscosity or np.any(model.opt.wind)
         # Whether a force depends on where the bodies are, other than through the joints.
         led = np.any(model.actuator_trntype > TRANSMISSION_BY_JOINT)

@@ -157,17 +157,8 @@ def supports(W: Any, rows: np.ndarray) -> np.ndarray:
     """Return max {row w : w in W} for each row; 0 if W is None. NumPy; not traceable."""
     if W is None or not len(rows):
         return np.zeros(len(rows))
-    if isinstance(W, Image):
-        return supports(W.of, rows @ host_array("disturbance_matrix", W.E))
-    if isinstance(W, Box):
-        lower, upper = W.spread(rows.shape[1]).bounds("disturbance")
-        return np.maximum(rows * lower, rows * upper).sum(axis=1)
-    if isinstance(W, Zonotope):
-        return host_array("disturbance", W.support(rows))
-    if isinstance(W, Vertices):
-        return (rows @ host_array("disturbance", W.points).T).max(axis=1)
-    limits = Polytope(rows, np.zeros(len(rows))).pontryagin_difference(W).h
-    return -host_array("disturbance", limits)
+    W = W.spread(rows.shape[1]) if isinstance(W, Box) else W
+    return host_array("disturbance", W.support(rows))
 
 
 def largest_norm(W: Any, P: np.ndarray, shift: np.ndarray | None = None) -> float:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxmpc.arrays import Reals, as_array, host_array
+from jaxmpc.arrays import Reals, as_array, fractions_of, host_array
 from jaxmpc.checks import fail, number, require_finite, require_kind, require_shape, whole
 from jaxmpc.pytrees import pytree, static
 from jaxmpc.sets.convex_sets import AnyNumber, Box, ConvexSet, Polytope, Zonotope
@@ -293,13 +293,12 @@ def _exact_alpha(
     closed: np.ndarray, E: np.ndarray, W: Box, spread: np.ndarray, steps: int
 ) -> Fraction:
     """Return the least α that supports along coordinates show, without rounding."""
-    exact = lambda v: np.asarray(np.frompyfunc(Fraction, 1, 1)(np.asarray(v, float)), object)
-    A, M = exact(closed), exact(np.eye(len(closed)))
-    E, D, lower, upper = (exact(v) for v in (E, spread, W.lower, W.upper))
+    A, M = fractions_of(closed), fractions_of(np.eye(len(closed)))
+    E, D, lower, upper = (fractions_of(v) for v in (E, spread, W.lower, W.upper))
     for _ in range(steps):
         M = M @ A
     worst = Fraction(0)
-    for rows, own in ((M, exact(np.eye(len(M)))), (-M, -exact(np.eye(len(M))))):
+    for rows, own in ((M, fractions_of(np.eye(len(M)))), (-M, -fractions_of(np.eye(len(M))))):
         ends = [np.maximum(v @ E * lower, v @ E * upper).sum(axis=1) for v in (rows, own)]
         moved = ends[0] + abs(rows) @ D
         worst = max(worst, *(moved / (D if spread.any() else ends[1])))

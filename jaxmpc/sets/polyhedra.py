@@ -68,14 +68,15 @@ def _equalities(argument: str, whole: AffineHull) -> AffineHull:
 
 
 def independent(G: np.ndarray, g: np.ndarray) -> np.ndarray:
-    """Return the indices of independent ones of rows G x = g, as many as there are."""
+    """Return the indices of independent ones of rows G x = g, as many as there are, in scaled
+    columns."""
     if not len(g):
         return np.zeros(0, int)
     row, column = scaling(G, g)
     scaled = row[:, None] * G * column
     _, R, order = scipy.linalg.qr(scaled.T, mode="economic", pivoting=True)
     size = np.abs(np.diag(R))
-    return np.sort(order[: int((size > 1e-9 * size[0]).sum())])
+    return np.sort(order[: int((size > FLAT * size[0]).sum())])
 
 
 def hull(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxmpc.arrays import Reals, as_weight, host_array
+from jaxmpc.arrays import Reals, as_weight, fractions_of, host_array
 from jaxmpc.checks import fail, require_finite, require_kind, require_shape
 from jaxmpc.pytrees import record
 from jaxmpc.sets.control_invariant import largest_cut
@@ -241,7 +241,7 @@ class _Loop(NamedTuple):
     @property
     def exactly_closed(self) -> np.ndarray:
         """Return A + BK as Fractions, without rounding."""
-        return _fractions(self.A) + _fractions(self.B) @ _fractions(self.K)
+        return fractions_of(self.A) + fractions_of(self.B) @ fractions_of(self.K)
 
 
 class _Invariance(NamedTuple):
@@ -373,7 +373,7 @@ class _Ellipse:
         )
         if loop.W is None and not loop.c.any():
             if len(P) <= 8:
-                A, F = loop.exactly_closed, _fractions(P)
+                A, F = loop.exactly_closed, fractions_of(P)
                 if _positive(F - A.T @ F @ A):
                     sentence += ", and the matrix is positive definite in rational arithmetic"
             holds = factor <= 1 + _TOUCH
@@ -605,14 +605,14 @@ def _exact_factor(M: np.ndarray, X_f: _Rows, loop: _Loop) -> Fraction | None:
     exact_ends = box is None or isinstance(box, Box)
     if len(X_f.g) ** 2 * n > _EXACT_PRODUCTS or not exact_ends:
         return None
-    H, h = _fractions(X_f.G), _fractions(X_f.g)
-    images, bounds = H @ loop.exactly_closed, H @ _fractions(loop.c)
+    H, h = fractions_of(X_f.G), fractions_of(X_f.g)
+    images, bounds = H @ loop.exactly_closed, H @ fractions_of(loop.c)
     if isinstance(box, Box):
-        ends, along = (_fractions(box.lower), _fractions(box.upper)), H @ _fractions(E)
+        ends, along = (fractions_of(box.lower), fractions_of(box.upper)), H @ fractions_of(E)
         bounds = bounds + np.maximum(along * ends[0], along * ends[1]).sum(axis=1)
     for i, image in enumerate(images):
         used = np.flatnonzero(M[i] > 0)
-        y = _fractions(M[i, used])
+        y = fractions_of(M[i, used])
         if len(used) == n:
             solved = _solved_exactly(H[used].T, image)
             y = solved if solved is not None and min(solved) >= 0 else y
@@ -620,13 +620,8 @@ def _exact_factor(M: np.ndarray, X_f: _Rows, loop: _Loop) -> Fraction | None:
         off = np.flatnonzero(left)
         if not np.isfinite(X_f.extent[off]).all():
             return None
-        bounds[i] += (y * h[used]).sum() + (left[off] * _fractions(X_f.extent[off])).sum()
+        bounds[i] += (y * h[used]).sum() + (left[off] * fractions_of(X_f.extent[off])).sum()
     return max(bounds / h)
-
-
-def _fractions(array: Reals) -> np.ndarray:
-    """Return an array of Fractions, each exactly the float it comes from."""
-    return np.asarray(np.frompyfunc(Fraction, 1, 1)(np.asarray(array, np.float64)), object)
 
 
 def _solved_exactly(matrix: np.ndarray, right: np.ndarray) -> np.ndarray | None:

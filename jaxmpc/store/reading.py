@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from jaxmpc.batches import cores, side_by_side
+from jaxmpc.batches import cores, side_by_side, slices
 from jaxmpc.checks import fail, in_units, require_memory, shortened, shown
 from jaxmpc.files import faithful, fingerprint, text_within
 from jaxmpc.grids import mesh
@@ -120,11 +120,7 @@ def text_of(path: Path | str, name: str) -> str:
 
 def regions(shape: Sequence[int], block: Sequence[int]) -> list[tuple[slice, ...]]:
     """Return the parts of a grid that blocks of this shape cover, in C order."""
-    along = [
-        [slice(first, min(first + take, count)) for first in range(0, count, take)]
-        for count, take in zip(shape, block, strict=True)
-    ]
-    return list(itertools.product(*along))
+    return list(itertools.product(*map(slices, shape, block)))
 
 
 def checksum(arrays: Mapping[str, np.ndarray]) -> int:

@@ -5,7 +5,6 @@ import math
 import os
 import shutil
 import sys
-import uuid
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -14,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 import numpy as np
 
 from jaxmpc.checks import entries, fail, whole
-from jaxmpc.files import differences, versions
+from jaxmpc.files import differences, side_path, versions
 from jaxmpc.store.reading import (
     array_of,
     blocks_there,
@@ -586,11 +585,6 @@ def consolidate(group: "zarr.Group") -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # zarr says that its format 3 has no standard for it yet
         zarr.consolidate_metadata(group.store)
-
-
-def side_path(path: Path) -> Path:
-    """Return a new name beside a path; what lies there is a leftover once its process has ended."""
-    return path.with_name(f".{path.name}.{uuid.uuid4().hex}")
 
 
 def require_removable(path: str | Path) -> Path:

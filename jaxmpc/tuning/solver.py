@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jax import Array
+from scipy.linalg import block_diag
 
 from jaxmpc.arrays import Reals
 from jaxmpc.batches import Compiled, Devices, chosen_devices, divisible, each_part, over_devices
@@ -33,6 +34,7 @@ from jaxmpc.mpc.condense import condensed_in_float64, in_float64
 from jaxmpc.mpc.controller import Controller, plan_with, stated_terms, with_solver
 from jaxmpc.mpc.plan import Aim, Plan, WarmStart, checked_array
 from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.rows import Layout
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.linalg import rounding
@@ -56,9 +58,6 @@ SOLVER = ADMM(newton_steps=0)
 MARGIN = 0.3
 # Values of a group along the horizon, between which log rho is interpolated.
 KNOTS = 5
-
-# (kind, steps, rows a step) of each block of rows.
-Blocks = tuple[tuple[str, tuple[int, ...], int], ...]
 
 
 def tune_solver(
@@ -428,7 +427,7 @@ def score(status: np.ndarray, worst: np.ndarray) -> dict[str, float]:
 
 
 def interpolation(
-    groups: str, blocks: Blocks, horizon: int, balls: tuple[int, ...] = (), knots: int = KNOTS
+    groups: str, blocks: Layout, horizon: int, balls: tuple[int, ...] = (), knots: int = KNOTS
 ) -> np.ndarray:
     """Return W (rows, parameters): log rho = W θ.
 
@@ -447,12 +446,7 @@ def interpolation(
             ends, at = np.linspace(0, 1, knots), np.array(steps) / horizon
             along = np.stack([np.interp(at, ends, hat) for hat in np.eye(knots)], axis=1)
         columns.append(np.kron(along, np.ones((size, 1)) if ball else np.eye(size)))
-    rows, parameters = (sum(part.shape[k] for part in columns) for k in (0, 1))
-    W, row, column = np.zeros((rows, parameters)), 0, 0
-    for part in columns:
-        W[row : row + part.shape[0], column : column + part.shape[1]] = part
-        row, column = row + part.shape[0], column + part.shape[1]
-    return W
+    return block_diag(*columns)
 
 
 def transfer_penalties(run: TuningRun, mpc: MPC, iterations: int | None = None) -> ADMM:

@@ -158,11 +158,7 @@ class Programs:
         """Return lower and upper bounds (moves, m) of the inputs and of the states that are not
         mapped: the limits on each alone, and where there are none those of linear programs over all
         trajectories, enlarged by a part in 10⁶ of their size; ±∞ where there are none."""
-        p = self.p
-        size = int(p.moves.max()) + 1, p.sizes[1]
-        low, high = np.full(size, -np.inf), np.full(size, np.inf)
-        for move, i, least, most in p.input_rows():
-            low[move, i], high[move, i] = max(low[move, i], least), min(high[move, i], most)
+        p, (low, high) = self.p, self.p.input_box()
         found = low.ravel(), high.ravel(), p.low.copy(), p.high.copy()
         place = np.arange(self.states, self.count), p.others
         for (lower, upper), entries in zip((found[:2], found[2:]), place, strict=True):
@@ -175,7 +171,7 @@ class Programs:
                     ends.append(sign * best.fun if best.status == 0 else -sign * np.inf)
                 room = 1e-6 * np.max(np.abs(ends), initial=0.0, where=np.isfinite(ends))
                 lower[j], upper[j] = max(lower[j], ends[0] - room), min(upper[j], ends[1] + room)
-        return found[0].reshape(size), found[1].reshape(size), found[2], found[3]
+        return found[0].reshape(low.shape), found[1].reshape(low.shape), found[2], found[3]
 
 
 class AffinePrograms(Programs):
@@ -251,11 +247,7 @@ class AffinePrograms(Programs):
     def boxes(self) -> tuple[np.ndarray, ...]:
         """Return lower and upper bounds (moves, m) of the inputs and of the states that are not
         mapped: the limits on each alone, ±∞ where there are none."""
-        size = int(self.p.moves.max()) + 1, self.p.sizes[1]
-        low, high = np.full(size, -np.inf), np.full(size, np.inf)
-        for move, i, least, most in self.p.input_rows():
-            low[move, i], high[move, i] = max(low[move, i], least), min(high[move, i], most)
-        return low, high, self.p.low, self.p.high
+        return *self.p.input_box(), self.p.low, self.p.high
 
 
 class _Entries:

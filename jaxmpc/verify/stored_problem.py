@@ -1,6 +1,6 @@
 """The problem as a store has it: JSON data, checked, and its hard constraints as arrays."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from functools import cached_property
 from typing import Any
 
@@ -117,11 +117,9 @@ class Constraints:
         self.widest = self.lower, self.upper
         described = plain.get("disturbance", {"policy": ""})
         as_given = self.H, self.D, self.lower, self.upper
-        if described["policy"] == "tightened":
-            both = tightened(described, self.A[0], self.B[0], *as_given)
-            (self.lower, self.upper), self.widest = both
-        if described["policy"] == "tube":
-            both = tightened_by_section(described, self.A[0], self.B[0], *as_given)
+        tighten = {"tightened": tightened, "tube": tightened_by_section}.get(described["policy"])
+        if tighten is not None:
+            both = tighten(described, self.A[0], self.B[0], *as_given)
             (self.lower, self.upper), self.widest = both
         ball = plain["ellipsoid"]
         self.P = None if ball is None else np.zeros((n, n))
@@ -191,8 +189,11 @@ class Constraints:
         X = np.linalg.pinv(np.reshape(rows, (-1, moves * m)))
         return where, X.T.reshape(-1, moves, m)[:, self.moves]
 
-    def input_rows(self) -> Iterator[tuple[int, int, float, float]]:
-        """Yield (move, i, lower, upper) for each row that bounds an input u_i alone."""
+    def input_box(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return lower and upper bounds (moves, m) of the inputs by the rows that each bound one
+        u_i alone, ±∞ where there are none."""
+        size = int(self.moves.max()) + 1, self.sizes[1]
+        low, high = np.full(size, -np.inf), np.full(size, np.inf)
         for k in range(self.N):
             D = self.D[k]
             alone = (self.H[k] == 0).all(axis=1) & (np.sum(D != 0, axis=1) == 1)
@@ -200,7 +201,9 @@ class Constraints:
                 i = int(np.flatnonzero(D[row])[0])
                 ends = self.widest[0][k][row], self.widest[1][k][row]
                 lower, upper = ends if D[row, i] > 0 else (-ends[1], -ends[0])
-                yield int(self.moves[k]), i, lower, upper
+                at = self.moves[k], i
+                low[at], high[at] = max(low[at], lower), min(high[at], upper)
+        return low, high
 
     def exponent(self, *more: np.ndarray) -> int:
         """Return e such that all data, and these arrays, are integers over 2ᵉ."""

@@ -12,8 +12,7 @@ from jaxmpc.app.options.shared import (
     print_table,
     refuse,
 )
-from jaxmpc.checks import fail
-from jaxmpc.files import open_folder
+from jaxmpc.files import open_folder, require_new
 from jaxmpc.recursion import recursive_feasibility, smallest_horizon
 from jaxmpc.recursion.report import FILES, save_report
 from jaxmpc.robot_maps.stored_sweep import sweep_robot
@@ -40,9 +39,7 @@ class Recursion(RecursionOptions):
         mpc, settings = config.build_mpc(), config.recursion
         asked = any(v is not None for v in (settings.grid, settings.lower, settings.upper))
         states = configs.recursion_states(config) if asked else None
-        there = [self.output / name for name in FILES if (self.output / name).exists()]
-        if there and not self.overwrite:
-            fail(str(there[0]), "exists", "Add --overwrite to replace it")
+        require_new([self.output / name for name in FILES], self.overwrite)
         open_folder(self.output)
         print(f"{config.name}: horizon {mpc.horizon} -> {self.output}")
         seconds = settings.seconds / (1 if self.smallest is None else 2)

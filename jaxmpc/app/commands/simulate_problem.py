@@ -13,7 +13,7 @@ from jaxmpc.app.options.shared import print_table
 from jaxmpc.checks import fail, require_memory
 from jaxmpc.closed_loop.disturbances import draw_disturbances, worst_disturbance
 from jaxmpc.closed_loop.simulation import Run, simulate
-from jaxmpc.files import as_json, open_folder, versions, write_arrays, write_json
+from jaxmpc.files import as_json, open_folder, require_new, versions, write_arrays, write_json
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.plan import broken_at_start
 from jaxmpc.mpc.problem import MPC, Outputs, as_tuple, output_stages
@@ -107,9 +107,7 @@ def simulate_problem(loops: LinearLoops, output: Path, overwrite: bool) -> None:
     that ascent by gradient finds for each start. Raises ValueError for what makes no sense.
     """
     config = loops.config
-    there = [output / name for name in FILES if (output / name).exists()]
-    if there and not overwrite:
-        fail(str(there[0]), "exists", "Add --overwrite to replace it")
+    require_new([output / name for name in FILES], overwrite)
     mpc = config.build_controlled()
     if mpc.disturbance is None and loops.disturbance is not None:
         fail("--disturbance", f"{loops.disturbance}, and the file has none", "Add [disturbance]")

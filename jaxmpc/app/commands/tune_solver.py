@@ -27,11 +27,10 @@ from jaxmpc.mpc.tightening import require_tightened
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status
 from jaxmpc.tuning.result import CHECKPOINT, TuningRun, run_folder
-from jaxmpc.tuning.solver import tune_solver
+from jaxmpc.tuning.solver import SOLVER, tune_solver
 from jaxmpc.tuning.tasks import feasible_states, initial_range
 
 FILES = ("solver.json", TUNED, "solver.png")
-GIVEN = ADMM(newton_steps=0)
 KEPT = "no step is better on the validation states: the default is kept"
 
 
@@ -71,7 +70,7 @@ class TuneSolver(TuneSolverOptions):
                 lambda: tune_solver(
                     mpc,
                     x0s[:-for_validation],
-                    solver=GIVEN,
+                    solver=SOLVER,
                     optimizer=optimizer,
                     validation=test,
                     checkpoint=checkpoint,
@@ -82,7 +81,7 @@ class TuneSolver(TuneSolverOptions):
                 )
             )
         seconds = time.perf_counter() - learning
-        given = dataclasses.replace(GIVEN, iterations=self.iterations)
+        given = dataclasses.replace(SOLVER, iterations=self.iterations)
         worst = largest_residuals(mpc, test, (given, run.solver))
         infeasible = without_plan + round(run.after["infeasible"])
         save_run(self.output, config, run, options, worst, infeasible, seconds)

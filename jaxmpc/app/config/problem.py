@@ -385,8 +385,8 @@ class Config:
             input_rate_limit=as_array(limits.input_rate_limit),
             input_rate_weight=as_array(cost.input_rate_weight),
             stage_weights=as_array(cost.stage_weights),
-            outputs=tuple(_outputs(rows) for rows in self.outputs if rows.rho is None),
-            soft=tuple(_soft(rows) for rows in self.outputs if rows.rho is not None),
+            outputs=tuple(rows for rows in map(_rows, self.outputs) if isinstance(rows, Outputs)),
+            soft=tuple(rows for rows in map(_rows, self.outputs) if isinstance(rows, Soft)),
             **against,
         )
         mpc.validate()
@@ -618,32 +618,13 @@ def as_array(value: Any) -> np.ndarray | None:
     return None if value is None else np.asarray(value, dtype=np.float64)
 
 
-def _outputs(rows: OutputsSection) -> Outputs:
-    """Return hard rows of outputs."""
-    return Outputs(
-        np.asarray(rows.C),
-        as_array(rows.lower),
-        as_array(rows.upper),
-        as_array(rows.D),
-        rows.stages,
-        rows.names,
-        rows.units,
-    )
-
-
-def _soft(rows: OutputsSection) -> Soft:
-    """Return soft rows of outputs."""
-    return Soft(
-        np.asarray(rows.C),
-        as_array(rows.lower),
-        as_array(rows.upper),
-        np.asarray(rows.rho),
-        rows.quadratic or 0.0,
-        as_array(rows.D),
-        rows.stages,
-        rows.names,
-        rows.units,
-    )
+def _rows(given: OutputsSection) -> Outputs | Soft:
+    """Return rows of outputs: hard ones without rho."""
+    named: dict[str, Any] = {key: getattr(given, key) for key in ("stages", "names", "units")}
+    named |= {key: as_array(getattr(given, key)) for key in ("C", "lower", "upper", "D")}
+    if given.rho is None:
+        return Outputs(**named)
+    return Soft(**named, rho=np.asarray(given.rho), quadratic=given.quadratic or 0.0)
 
 
 def to_matrix(value: Any) -> np.ndarray:

@@ -99,7 +99,7 @@ def plot_body(fmap: FeasibleSetMap) -> Figure:
     names, small = fmap.axis_names, for_column()
     if len(names) != 3:
         fail("fmap", f"maps {len(names)} states", "A body needs 3: choose `axes`")
-    inner, outer = _corners(fmap.inner), _corners(fmap.outer)
+    inner, outer = _corners(fmap.inner, 3), _corners(fmap.outer, 3)
     if not len(inner) and not len(outer):
         fail("fmap", "has no bounded body to draw", "Refine it, or map a set with an interior")
     figure = Figure(figsize=(COLUMN, 5.6) if small else (9.6, 8.0), layout="constrained")
@@ -138,13 +138,13 @@ def plot_body(fmap: FeasibleSetMap) -> Figure:
     return figure
 
 
-def _corners(make: Callable[[], Polytope | None]) -> np.ndarray:
-    """Return the vertices (k, 3) of a body; none if there is none, or it is flat or unbounded."""
+def _corners(make: Callable[[], Polytope | None], d: int) -> np.ndarray:
+    """Return the vertices (k, d) of a body; none if there is none, or it is flat or unbounded."""
     try:
         polytope = make()
-        return np.zeros((0, 3)) if polytope is None else polytope.require_body().vertices()
+        return np.zeros((0, d)) if polytope is None else polytope.require_body().vertices()
     except ValueError:
-        return np.zeros((0, 3))
+        return np.zeros((0, d))
 
 
 def _map_title(fmap: FeasibleSetMap) -> str:
@@ -444,9 +444,5 @@ def draw_values(ax: Axes, points: np.ndarray, value: np.ndarray, colours: dict[i
 
 def ring(make: Callable[[], Polytope | None]) -> np.ndarray:
     """Return the vertices of a polygon, the first again at the end; (0, 2) if there is none."""
-    try:
-        polytope = make()
-        corners = np.zeros((0, 2)) if polytope is None else polytope.require_body().vertices()
-    except ValueError:  # not bounded yet, or without interior: nothing to draw
-        return np.zeros((0, 2))
+    corners = _corners(make, 2)
     return np.vstack([corners, corners[:1]])

@@ -64,6 +64,7 @@ from jaxmpc.mpc.stagewise.newton_steps import (
     REST,
     Limits,
     Sides,
+    advanced,
 )
 from jaxmpc.mpc.stagewise.recursion_kernels import Gains, covariances, recurrence
 from jaxmpc.mpc.stagewise.stages import (
@@ -301,10 +302,6 @@ class Point(NamedTuple):
     t: Array
     a: Array
 
-    def moved(self, by: "Point", length: Array) -> "Point":
-        """Return the point `length` of the way along the step `by`."""
-        return jax.tree.map(lambda v, d: v + length * d, self, by)
-
 
 SIGNS = np.array([1.0, -1.0])[:, None, None]
 
@@ -440,7 +437,7 @@ def direction(c: Columns, at: Point) -> Point:
 
     def corrected(guess: Point, first: Array) -> tuple[Point, None]:
         reach = jnp.minimum(solver.length(at, guess), 1.0)
-        ratio = solver.mean(at.moved(guess, reach)) / jnp.where(mean > 0, mean, 1.0)
+        ratio = solver.mean(advanced(at, guess, reach)) / jnp.where(mean > 0, mean, 1.0)
         centre = mean * jnp.maximum(ratio**3, 1 - reach)
         g = guess.sides
         curved = jnp.stack([g.t * g.z, g.e * (limits.k * g.e - g.z)]), guess.t * guess.a
@@ -546,7 +543,7 @@ def policy_step(most: int, constants: tuple[Columns, Array], state: PolicySearch
     length = jnp.minimum(FRACTION * Solver.of(c).length(at, step), 1.0)
     sound = all_finite(step) & (length > REST)
     step = jax.tree.map(lambda d: jnp.where(sound, d, 0.0), step)
-    at = at.moved(step, jnp.where(sound, length, 0.0))
+    at = advanced(at, step, jnp.where(sound, length, 0.0))
     pair = measured_policy(eps, c, at)
     best, steps = state.best.or_better(pair), state.steps + 1
     lost = (state.least < BEGUN) & (pair.error > LOST * state.least)

@@ -143,9 +143,10 @@ class Sides(NamedTuple):
     z: Array
     e: Array
 
-    def moved(self, by: "Sides", length: Array) -> "Sides":
-        """Return the point `length` of the way along the step `by`."""
-        return Sides(*(v + length * d for v, d in zip(self, by, strict=True)))
+
+def advanced(at: Any, step: Any, length: Array) -> Any:
+    """Return the point `length` of the way along a step."""
+    return jax.tree.map(lambda v, d: v + length * d, at, step)
 
 
 class Limits(NamedTuple):
@@ -279,7 +280,7 @@ def interior_step(most: int, constants: tuple, state: SearchState) -> SearchStat
     mean = limits.mean(at)
     *_, guess = direction(jnp.zeros((2, *r.shape), r.dtype))
     reach = jnp.minimum(limits.length(at, guess), 1.0)
-    ratio = limits.mean(at.moved(guess, reach)) / jnp.where(mean > 0, mean, 1.0)
+    ratio = limits.mean(advanced(at, guess, reach)) / jnp.where(mean > 0, mean, 1.0)
     centre = mean * jnp.maximum(ratio**3, 1 - reach)
     curved = jnp.stack([guess.t * guess.z, guess.e * (limits.k * guess.e - guess.z)])
     dv, moved, step = direction(centre - jnp.clip(curved, -MOST_CURVED * mean, MOST_CURVED * mean))
@@ -288,7 +289,7 @@ def interior_step(most: int, constants: tuple, state: SearchState) -> SearchStat
     length = jnp.where(sound, jnp.where(first, 1.0, length), 0.0)
     clean = lambda tree: jax.tree.map(lambda d: jnp.where(sound, d, 0.0), tree)
     z = state.z + length * clean(moved)
-    begun, at = limits.start(v + dv), at.moved(clean(step), length)
+    begun, at = limits.start(v + dv), advanced(at, clean(step), length)
     at = jax.tree.map(lambda a, b: jnp.where(first, a, b), begun, at)
     y = s.bounds.admissible(fixed + E * limits.multipliers(at))
     found = conditions(s, z, y)
