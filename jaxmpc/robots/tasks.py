@@ -90,13 +90,14 @@ def distance(robot: Robot, first: str, second: Any) -> Callable[[Any], Array]:
         require_finite("second[0]", second[0])
         number("second[1]", second[1], 0.0, "Give a radius of at least 0")
         centre, radius = np.asarray(second[0], float), float(second[1])
-        segments.append(lambda data: (jnp.asarray(centre, data.qpos.dtype),) * 2 + (0.0,))
+        point = lambda data: jnp.asarray(centre, data.qpos.dtype)
+        segments.append(lambda data: (point(data), jnp.zeros(3, data.qpos.dtype), 0.0, 0.0))
 
     def between(data: Any) -> Array:
-        (a, b, r), (c, d, s) = (segment(data) for segment in segments)
-        gap = _between_segments(a, b, c, d)
-        length = jnp.sqrt(jnp.maximum(jnp.sum(gap**2), 1e-12))
-        return length - r - s - radius
+        first, second = (segment(data) for segment in segments)
+        gap = _between_segments(first, second)
+        length = jnp.sqrt(jnp.maximum(jnp.sum(gap**2), 1e-30))
+        return length - first[-1] - second[-1] - radius
 
     return between
 
@@ -131,34 +132,34 @@ def _number(robot: Robot, kind: str, name: str) -> int:
     return i
 
 
-def _segment(robot: Robot, name: str) -> Callable[[Any], tuple[Array, Array, float]]:
-    """Return the ends of a geom's middle line and its radius, as a function of mjx.Data."""
+# The middle of a line, its direction (of length one), half of its length and the radius around it.
+Segment = tuple[Array, Array, float, float]
+
+
+def _segment(robot: Robot, name: str) -> Callable[[Any], Segment]:
+    """Return a geom's middle line and its radius, as a function of mjx.Data."""
     model, i = robot.predictor.model, _number(robot, "geom", name)
     kind, (radius, half, _) = int(model.geom_type[i]), model.geom_size[i]
     if kind not in (SPHERE, CAPSULE):
         fail("name", f"geom {name!r} is neither a sphere nor a capsule", "Enclose it in one")
-    half = half if kind == CAPSULE else 0.0
-
-    def ends(data: Any) -> tuple[Array, Array, float]:
-        along = half * data.geom_xmat[i].reshape(3, 3)[:, 2]
-        return data.geom_xpos[i] - along, data.geom_xpos[i] + along, float(radius)
-
-    return ends
+    half = float(half) if kind == CAPSULE else 0.0
+    return lambda data: (data.geom_xpos[i], data.geom_xmat[i][2::3], half, float(radius))
 
 
-def _between_segments(a: Array, b: Array, c: Array, d: Array) -> Array:
-    """Return the vector (3,) between the nearest points of the segments ab and cd (Ericson 2005,
-    Real-Time Collision Detection, §5.1.9)."""
-    u, v, w = b - a, d - c, a - c
-    dot = lambda p, q: jnp.sum(p * q)
-    uu, vv, uv, uw, vw = dot(u, u), dot(v, v), dot(u, v), dot(u, w), dot(v, w)
-    tiny = 1e-12
-    uu, vv = jnp.maximum(uu, tiny), jnp.maximum(vv, tiny)
-    # Where both are nearly parallel the middle of ab serves; the clamps below do the rest.
-    denominator = uu * vv - uv**2
-    parallel = denominator < 1e-9 * uu * vv
-    s = jnp.where(parallel, 0.5, (uv * vw - vv * uw) / jnp.where(parallel, 1.0, denominator))
-    s = jnp.clip(s, 0.0, 1.0)
-    t = jnp.clip((uv * s + vw) / vv, 0.0, 1.0)
-    s = jnp.clip((uv * t - uw) / uu, 0.0, 1.0)
+def _between_segments(first: Segment, second: Segment) -> Array:
+    """Return the vector (3,) between the nearest points of two segments (Ericson 2005, Real-Time
+    Collision Detection, §5.1.9): those at the lengths s and t along them."""
+    (a, u, along_u, _), (b, v, along_v, _) = first, second
+    w, s, t = a - b, jnp.zeros((), a.dtype), jnp.zeros((), a.dtype)
+    if along_u and along_v:
+        # With (u·v)(v·w) − u·w = n·(v×w) and 1 − (u·v)² = n·n few digits cancel where they are
+        # nearly parallel. Where they are parallel the middle serves; the clamps do the rest.
+        n = jnp.cross(u, v)
+        sine, parallel = jnp.dot(n, n), jnp.finfo(n.dtype).eps ** 1.5
+        s = jnp.dot(n, jnp.cross(v, w)) / jnp.where(sine < parallel, 1.0, sine)
+        s = jnp.clip(jnp.where(sine < parallel, 0.0, s), -along_u, along_u)
+    if along_v:
+        t = jnp.clip(jnp.dot(v, w + s * u), -along_v, along_v)
+    if along_u:
+        s = jnp.clip(jnp.dot(u, t * v - w), -along_u, along_u)
     return w + s * u - t * v

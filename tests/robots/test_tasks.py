@@ -70,6 +70,49 @@ def engine(robot, xi):
     return model, data
 
 
+def nearest(first, second):
+    """The least distance of two segments in extended precision: of their lines where the nearest
+    points of these lie within, else of an end of one from the other."""
+    (a, u, p, _), (b, v, q, _) = (
+        (*(np.longdouble(part) for part in one[:2]), *one[2:]) for one in (first, second)
+    )
+    found = []
+    for c, d, w, length in ((a + p * u, b, v, q), (a - p * u, b, v, q)):
+        found.append(c - d - np.clip(w @ (c - d), -length, length) * w)
+    for c, d, w, length in ((b + q * v, a, u, p), (b - q * v, a, u, p)):
+        found.append(c - d - np.clip(w @ (c - d), -length, length) * w)
+    n = np.cross(u, v)
+    if n @ n > 0:
+        s, t = (n @ np.cross(w, a - b) / (n @ n) for w in (v, u))
+        if abs(s) <= p and abs(t) <= q:
+            found.append(a + s * u - b - t * v)
+    return min(np.sqrt(gap @ gap) for gap in found)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_distances_of_segments(dtype):
+    """Nearly parallel ones too, and spheres, whose length is zero; derivatives of length one."""
+    rng, eps = np.random.default_rng(0), np.finfo(dtype).eps
+    with jax.enable_x64(dtype == np.float64):
+        for lengths in ((0.0, 0.0), (0.5, 0.0), (0.0, 2.0), (1.0, 0.4)):
+            value = jax.jit(
+                jax.value_and_grad(
+                    lambda a, u, b, v, lengths=lengths: jnp.linalg.norm(
+                        tasks._between_segments((a, u, lengths[0], 0), (b, v, lengths[1], 0))
+                    )
+                )
+            )
+            for _ in range(100):
+                a, b, u, other = rng.normal(size=(4, 3))
+                v = u + 10 ** rng.uniform(-12, 1) * other
+                u, v = u / np.linalg.norm(u), v / np.linalg.norm(v)
+                a, b, u, v = (np.asarray(part, dtype) for part in (a, b, u, v))
+                found, slope = value(a, u, b, v)
+                wanted = nearest((a, u, lengths[0], 0), (b, v, lengths[1], 0))
+                np.testing.assert_allclose(found, float(wanted), rtol=0, atol=300 * eps)
+                np.testing.assert_allclose(np.linalg.norm(slope), 1, atol=1e-2)
+
+
 class TestFunctions:
     """Values are the C engine's, derivatives finite differences of them."""
 
