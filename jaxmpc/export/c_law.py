@@ -4,7 +4,8 @@ A node asks on which side of a half-space the state lies. The regions that reach
 seen from their vertices, go on to its children; the facet that leaves the fewer regions in the
 larger child is taken (Tøndel, Johansen, Bemporad 2003, "Evaluation of piecewise affine control via
 binary search tree", Automatica 39(5)). A leaf holds the regions that no facet tells apart, one
-mostly, and the code checks their facets: so its answer "inside" does not rest on the tree.
+mostly, and the code checks their facets: so its answer "inside" does not rest on the tree. Where
+rounding may decide a node it goes on to both children: so "outside" does not rest on signs either.
 """
 
 from pathlib import Path
@@ -150,6 +151,7 @@ def export_explicit_c(
         "law_offset": np.array([region.k for region in regions.regions]).T,
         **input_limits(mpc),
     }
+    number = lambda value: literal(value, files.real).replace("(real)", "")
     sizes = {
         "PARAMETERS": mpc.dimension,
         "INPUTS": mpc.system.m,
@@ -158,6 +160,7 @@ def export_explicit_c(
         "DEPTH": tree.depth,
         "MOST": int(tree.outside[tree.plane < 0].max()),  # regions of a leaf
         "RATES": int(mpc.rate_limited),
-        "TOLERANCE": literal(files.tolerance, files.real).replace("(real)", ""),
+        "TOLERANCE": number(files.tolerance),
+        "NEAR": number(max(files.tolerance, 10 * TOLERANCE[dtype])),
     }
     return files.write(("law.h", "law.c", "law_example.c"), sizes, tables, mpc.dimension)

@@ -45,20 +45,28 @@ int NAME_evaluate(const real x[NAME_PARAMETERS], real u[NAME_INPUTS]) {
       return NAME_NON_FINITE;
     }
   }
-  int node = 0;
-  while (node_plane[node] >= 0)
-    node = beyond(node_plane[node], x) <= 0 ? node_inside[node] : node_outside[node];
-  /* A leaf: node_inside is its first region in leaf_region, node_outside how many. */
-  int best = leaf_region[node_inside[node]];
+  /* Nodes to visit. So near a half-space that rounding may decide x goes to both sides, where the
+   * signs of several that meet need not fit each other. */
+  int waiting[NAME_DEPTH + 1] = {0}, count = 1, best = 0;
   real least = (real)INFINITY;
-  for (int j = 0; j < node_outside[node]; j++) {
-    int region = leaf_region[node_inside[node] + j];
-    real worst = (real)-INFINITY;
-    for (int f = facet_begin[region]; f < facet_begin[region + 1]; f++) {
-      real over = (real)facet_side[f] * beyond(facet_plane[f], x);
-      if (!(over <= worst)) worst = isfinite(over) ? over : (real)INFINITY;
+  while (count > 0 && !(least <= 0)) {
+    int node = waiting[--count];
+    if (node_plane[node] >= 0) {
+      real over = beyond(node_plane[node], x);
+      if (!(over <= (real)-NAME_NEAR)) waiting[count++] = node_outside[node];
+      if (!(over >= (real)NAME_NEAR)) waiting[count++] = node_inside[node];
+      continue;
     }
-    if (worst < least) least = worst, best = region;
+    /* A leaf: node_inside is its first region in leaf_region, node_outside how many. */
+    for (int j = 0; j < node_outside[node]; j++) {
+      int region = leaf_region[node_inside[node] + j];
+      real worst = (real)-INFINITY;
+      for (int f = facet_begin[region]; f < facet_begin[region + 1]; f++) {
+        real over = (real)facet_side[f] * beyond(facet_plane[f], x);
+        if (!(over <= worst)) worst = isfinite(over) ? over : (real)INFINITY;
+      }
+      if (worst < least) least = worst, best = region;
+    }
   }
   for (int i = 0; i < M; i++) {
     u[i] = law_offset[best * M + i];

@@ -1,7 +1,8 @@
 /* NAME: an explicit model predictive control law in C99, written by jaxmpc VERSION.
  *
  * The first input of the optimal plan is piecewise affine in the state. A search tree of half-spaces
- * leads to the piece: at most NAME_DEPTH products, and the facets of at most NAME_MOST regions.
+ * leads to the piece: at most NAME_DEPTH products, and the facets of at most NAME_MOST regions. (Of
+ * states within NAME_NEAR of a half-space both sides are looked at.)
  */
 #ifndef NAME_H
 #define NAME_H

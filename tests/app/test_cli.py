@@ -338,7 +338,7 @@ def test_recursion_writes_files_and_table(tmp_path, capsys, examined):
         assert data["state"].shape == (30, 2) and data["facet_normals"].shape == (4, 2)
         np.testing.assert_array_equal(data["lost_at"], np.arange(30) % 3)
     assert run(line) == 2
-    assert "exists. Add --overwrite" in capsys.readouterr().err
+    assert "exists. Overwrite it (overwrite=True, --overwrite)" in capsys.readouterr().err
     assert run(f"{line} --overwrite") == 0
 
 

@@ -66,6 +66,25 @@ def test_every_state_has_the_input_of_its_region(regions, tmp_path, dtype, error
     assert law([np.nan, 0.0]) == (0, 3)
 
 
+@compiled
+@pytest.mark.parametrize("dtype, error", [("float64", 1e-9), ("float32", 2e-4)])
+def test_where_many_facets_meet(tmp_path, dtype, error):
+    """Rounding gives signs there that fit no region, and led to a leaf far away."""
+    A = np.array([[1.0, 1, 1], [0, 1, 1], [0, 0, 1]])
+    B = np.array([[-0.6, -0.8], [-1.7, -0.4], [0.9, 0.2]])
+    states = jm.Box([-1.8, -1.4, -2.7], [1.8, 1.4, 2.7])
+    mpc = jm.MPC(
+        jm.LinearSystem(A, B), np.eye(3), 0.1 * np.eye(2), 3, terminal_cost=np.eye(3),
+        states=states, inputs=jm.Box([-0.3] * 2, [0.3] * 2), terminal_set=states,
+    )  # fmt: skip
+    regions = jm.explicit.critical_regions(mpc)
+    law, points = built(regions, tmp_path, dtype), [r.vertices for r in regions.regions]
+    for vertex, u in zip(np.vstack(points), regions.law(np.vstack(points)), strict=True):
+        found, status = law(vertex)
+        assert status == 1
+        np.testing.assert_allclose(found, u, rtol=0, atol=error)
+
+
 @pytest.mark.long
 @compiled
 def test_a_law_in_other_units(regions, tmp_path):
