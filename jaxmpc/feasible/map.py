@@ -251,8 +251,7 @@ class FeasibleSetMap:
             return self
         box = self.problem.programs.bounding_box[0]
         if left > gap and box is not None and np.all(np.isfinite(box)):
-            what = f"differ by {left:.2g} of it, more than the gap {gap:.2g}"
-            warnings.warn(f"refine: the bounds of the volume {what}", stacklevel=2)
+            warn_of_gap(left, gap)
         points, _, normals, offsets, _ = proved
         labels = excluded(self.labels, rays.exact, self.x0s, normals, offsets)
         return replace(
@@ -284,6 +283,12 @@ class FeasibleSetMap:
             "input": list(self.mpc.system.input_labels),
         }
         return xr.Dataset(data, coords=names)
+
+
+def warn_of_gap(left: float, gap: float) -> None:
+    """Warn that the bounds of a volume differ by `left` of it after `refine`."""
+    what = f"differ by {left:.2g} of it, more than the gap {gap:.2g}"
+    warnings.warn(f"refine: the bounds of the volume {what}", stacklevel=3)
 
 
 def scaled_back(body: Polytope, unit: np.ndarray) -> Polytope:

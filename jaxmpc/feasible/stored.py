@@ -13,6 +13,7 @@ centre last, and those of the cone by corner (cones, vertex).
 
 import re
 import sys
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -26,7 +27,7 @@ from jaxmpc.arrays import Reals
 from jaxmpc.batches import CHUNK, Part, Timing, default_chunk, work_off
 from jaxmpc.checks import counted, entries, fail, require_kind, require_real
 from jaxmpc.feasible.hard_constraints import Axes
-from jaxmpc.feasible.map import BOUNDS, EXECUTOR, MEANINGS, FeasibleSetMap, excluded
+from jaxmpc.feasible.map import BOUNDS, EXECUTOR, MEANINGS, FeasibleSetMap, excluded, warn_of_gap
 from jaxmpc.feasible.pipeline import (
     MOST_PROGRAMS,
     PROOFS,
@@ -152,7 +153,9 @@ class StoredMap:
         """Return the map with the bounds that rays add, and write these into the store; see
         `FeasibleSetMap.refine`. Undecided points that they exclude count as infeasible."""
         none = np.zeros((0, self.problem.dimension))
-        alone = FeasibleSetMap.of(self.problem, none, Labels.empty(0, self.problem)).refine(gap)
+        with warnings.catch_warnings(record=True) as told:  # of the gap of these rays alone
+            warnings.filterwarnings("always", message="refine:")
+            alone = FeasibleSetMap.of(self.problem, none, Labels.empty(0, self.problem)).refine(gap)
         normals, offsets = alone.bound_normal, alone.bound_offset
         if self.undecided and len(offsets) and not isinstance(self.problem, PolicyProblem):
             exact = Rays.of(self.problem).exact
@@ -166,11 +169,16 @@ class StoredMap:
             {name: Constant(getattr(alone, name), BOUNDS[name], about[name]) for name in BOUNDS}
         )
         old = self.bounds
-        return self._with_bounds(
+        joined = self._with_bounds(
             np.concatenate([old.bound_point, alone.bound_point]),
             np.concatenate([old.bound_normal, normals]),
             np.concatenate([old.bound_offset, offsets]),
         )
+        if told:
+            low, high = joined.bounds.volume_bounds()
+            if gap * high < high - low < np.inf:
+                warn_of_gap((high - low) / high, gap)
+        return joined
 
     def _with_bounds(
         self, points: np.ndarray, normals: np.ndarray, offsets: np.ndarray

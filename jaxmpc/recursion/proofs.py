@@ -306,14 +306,15 @@ def settle_by_regions(claims: Claims, max_regions: int, deadline: float = np.inf
     for region in found.regions:
         E, e = A + B @ region.K, B @ region.k + c
         after = (region.vertices @ E.T + e) @ body.normals.T
-        beyond = np.max((after - room) / body.depths, axis=1)
-        violation.extend(beyond)
+        beyond = (after - room) / body.depths
+        violation.extend(beyond.max(axis=1))
         parts.append(region.vertices)
-        if found.complete and beyond.max() > CLEAR:
+        # A law often leads a region exactly onto a facet: rounding must not take that for beyond.
+        passed = beyond.max(axis=0) > CLEAR
+        if found.complete and passed.any():
             H, h = np.asarray(region.polytope.H), np.asarray(region.polytope.h)
-            # A law often leads exactly onto a facet, which rounding must not take for beyond it.
-            inside = room - body.normals @ e + CLEAR * body.depths
-            stays = Polytope(np.vstack([H, body.normals @ E]), np.append(h, inside))
+            normals, inside = body.normals[passed], (room - body.normals @ e)[passed]
+            stays = Polytope(np.vstack([H, normals @ E]), np.append(h, inside))
             lost += region.volume - _volume(stays)
     values, states = np.array(violation[1:]), np.concatenate(parts)
     top, lost = values.max(initial=-np.inf), lost if found.complete else np.nan

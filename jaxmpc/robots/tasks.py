@@ -143,7 +143,12 @@ def _segment(robot: Robot, name: str) -> Callable[[Any], Segment]:
     if kind not in (SPHERE, CAPSULE):
         fail("name", f"geom {name!r} is neither a sphere nor a capsule", "Enclose it in one")
     half = float(half) if kind == CAPSULE else 0.0
-    return lambda data: (data.geom_xpos[i], data.geom_xmat[i][2::3], half, float(radius))
+    return lambda data: (
+        data.geom_xpos[i],
+        data.geom_xmat[i].reshape(3, 3)[:, 2],
+        half,
+        float(radius),
+    )
 
 
 def _between_segments(first: Segment, second: Segment) -> Array:

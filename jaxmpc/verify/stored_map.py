@@ -122,7 +122,10 @@ def find_store(path: str | Path) -> str | Path:
     inside = [path / name for name in names if (path / name).exists()]
     if len(inside) != 1:
         what = f"holds {' and '.join(v.name for v in inside)}" if inside else "holds no labels"
-        fail(str(path), what, "Give the folder of a sweep or a recursion report, or what it holds")
+        cure = "Give the folder of a sweep or a recursion report, or what it holds"
+        if not inside and (path / "summary.json").exists():
+            cure = "Of a sweep with --store give what that named: jaxmpc verify STORE"
+        fail(str(path), what, cure)
     return inside[0]
 
 

@@ -405,6 +405,7 @@ LINES = [
     ("info --steps x", "--steps: x. Give a whole number"),
     ("info --loops 0", "--loops: 0"),
     ("info --html .", "--html .: is a folder. Name a file in it"),
+    ("info --html file", "--html file: exists and is no .html file. Name another one"),
     ("info --seconds 0", "--seconds: 0.0"),
     ("info --seconds soon", "--seconds: soon. Give a number"),
     ("info --horizon 1000000", "command line: --horizon: needs "),

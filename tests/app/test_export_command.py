@@ -1,5 +1,6 @@
 """`jaxmpc export`: each kind of law leaves what its last line tells how to use."""
 
+import re
 import shutil
 import subprocess
 
@@ -39,3 +40,40 @@ def test_steps_of_a_law_that_takes_none(tmp_path, capsys):
     words = ["export", "--law", "explicit", "--iterations", "9", "--output", str(tmp_path)]
     assert cli.main(words) == 2
     assert "--iterations: 9 where --law explicit has regions" in capsys.readouterr().err
+
+
+FILE = """name = "p"
+[system]
+A = [[1.0, 0.1], [0.0, 1.0]]
+B = [[0.005], [0.1]]
+dt = 0.1
+[limits]
+x_min = [-2.0, -1.0]
+x_max = [2.0, 1.0]
+u_min = [-1.0]
+u_max = [1.0]
+[cost]
+Q = [10.0, 1.0]
+R = [0.1]
+[mpc]
+horizon = 4
+"""
+
+
+@pytest.mark.parametrize(
+    "old, new, message",
+    [
+        ("[limits]", "[reference]\nstate = [0.5, 0.0]\n[limits]", "reference: is given, .*--law s"),
+        ("[-2.0, -1.0]", '["-Infinity", -1.0]', "limits.x_min, x_max: leave .* Bound every state"),
+        ("R = [0.1]", "R = [0.1]\nrho = 100.0", "cost.rho: has rows"),
+        ("horizon = 4", 'horizon = 4\nterminal = "ellipsoid"', "mpc.terminal: is an ellipsoid"),
+    ],
+)
+def test_what_has_no_regions_names_the_key(old, new, message, tmp_path, capsys):
+    """The regions are those of one law, about the origin, of a bounded set."""
+    path = tmp_path / "p.toml"
+    path.write_text(FILE.replace(old, new))
+    words = ["export", "--law", "explicit", "--config", str(path), "--output", str(tmp_path / "e")]
+    assert cli.main(words) == 2
+    assert re.search("p.toml: " + message, capsys.readouterr().err)
+    assert not (tmp_path / "e" / "mpc.c").exists()

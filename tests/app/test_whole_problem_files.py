@@ -110,6 +110,17 @@ def test_old_results_are_read_as_they_were(write):
     assert "constrained_stages" not in stored["mpc"]
 
 
+def test_empty_and_zero_are_not_absent(write):
+    """State limits at no stage, and inputs that may not move: other problems than without."""
+    path = write("constrained_stages = [1, 2, 3, 4]", "constrained_stages = []")
+    stored = configs.load(path).to_dict()
+    assert stored["mpc"]["constrained_stages"] == []
+    assert configs.from_results(stored).build_mpc().constrained_stages == ()
+    path = write("input_rate_limit = 0.5", "input_rate_limit = 0.0")
+    stored = configs.load(path).to_dict()
+    assert configs.from_results(stored).build_mpc().input_rate_limit == 0.0
+
+
 @pytest.mark.slow
 def test_a_map_with_limited_rates(write, tmp_path):
     """The previous input is a state: by name, zero where nothing is said, or mapped."""

@@ -284,6 +284,17 @@ class TestProofs:
         assert holds(settled(replace(mpc, horizon=4))) == (False, False, False)
 
 
+def test_the_law_loses_what_any_input_loses():
+    """To all digits: rounding of a row is no room that is kept."""
+    mpc = jm.MPC(
+        jm.LinearSystem([[1.0, 0.1], [0.0, 1.0]], [0.005, 0.1]), [10.0, 1.0], 0.1, 4,
+        states=jm.Box([-2.0, -1.0], [2.0, 1.0]), inputs=jm.Box(-1.0, 1.0),
+    )  # fmt: skip
+    report = recursive_feasibility(mpc, steps=1, search=False)
+    assert report.lost_by_any == pytest.approx(0.04225, abs=1e-12)
+    assert report.lost_by_law == pytest.approx(0.04225, abs=1e-12)
+
+
 class TestReport:
     @pytest.mark.slow
     def test_lecture_loses_and_keeps(self):

@@ -14,14 +14,35 @@ from jaxmpc.app.options.shared import (
     print_table,
 )
 from jaxmpc.checks import fail
-from jaxmpc.explicit.regions import critical_regions
+from jaxmpc.explicit.regions import CriticalRegions, critical_regions
 from jaxmpc.export.c_files import CFiles
 from jaxmpc.export.c_law import export_explicit_c
 from jaxmpc.export.c_solver import TOLERANCE, check_fixed_steps, export_c
 from jaxmpc.export.jax_program import export_jax
 from jaxmpc.export.step_search import choose_steps
 from jaxmpc.files import as_json
+from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.admm import ADMM
+
+
+def _regions(config: configs.Config, mpc: MPC) -> CriticalRegions:
+    """Return the critical regions of a file's problem. Raises ValueError, naming its keys, where
+    there are none to export."""
+    if any(np.any(given) for given in config.references().values()):
+        what = "is given, and regions are those of the law whose set-point is the origin"
+        cure = "Take --law steps, whose C function takes references, or leave the section out"
+        raise config.origin.error(f"reference: {what}. {cure}")
+    try:
+        regions = critical_regions(mpc)
+    except ValueError as error:
+        raise config.origin.error(config.renamed(str(error))) from None
+    if regions.window is not None:
+        what = "leave the feasible set unbounded, and a table of regions ends"
+        raise config.origin.error(f"limits.x_min, x_max: {what}. Bound every state")
+    if regions.tied:
+        what = "makes the feasible set flat, and no state that is measured lies in it"
+        raise config.origin.error(f"mpc.terminal: {what}. Take a terminal set with volume")
+    return regions
 
 
 class Export(ExportOptions):
@@ -60,7 +81,7 @@ class Export(ExportOptions):
             )
         if self.law == "explicit":
             print("searching regions", file=sys.stderr)
-            regions = critical_regions(mpc)
+            regions = _regions(config, mpc)
             paths = export_explicit_c(
                 regions,
                 self.output,
@@ -85,6 +106,8 @@ class Export(ExportOptions):
                 overwrite=self.overwrite,
             )
             summary |= {"iterations": solver.iterations, "tolerance": tolerance}
+        if config.references():
+            rows.append(("reference", "an argument of the function; the code has none"))
         print(f"{config.name}\n")
         kind = "" if self.law == "jax" else " of text"
         size = lambda path: f"{path.stat().st_size / 1024:.1f} KiB{kind}"

@@ -70,6 +70,8 @@ class Recursion(RecursionOptions):
             except ValueError as error:
                 rows.append(("picture", f"none: {error}"))
         print(report)
+        if config.references():
+            rows.append(("set-point", "the claim on the law is of the origin, not of [reference]"))
         rows.append(("total", f"{time.perf_counter() - begun:.2f} s with set-up and files"))
         rows.append(("files", " ".join(str(self.output / name) for name in files)))
         print_table(rows, 20)

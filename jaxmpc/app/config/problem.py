@@ -213,6 +213,7 @@ SECTION_COMMANDS = ("sweep", "recursion")
 KEYS = {
     **{name: f"system.{name}" for name in ("A", "B", "c", "dt", "state_names", "state_units")},
     **{name: f"system.{name}" for name in ("input_names", "input_units", "time_unit")},
+    "mpc.soft": "cost.rho",
     "Q": "cost.Q",
     "R": "cost.R",
     "terminal_cost": "cost.P",
@@ -317,7 +318,7 @@ class Config:
         for section, keys in NEWER.items():
             part = data if section == "" else data[section]
             for key in keys:
-                if not part[key]:
+                if part[key] is None or (key == "outputs" and not part[key]):
                     del part[key]
         return {
             key: part for key, part in data.items() if key == command or key not in SECTION_COMMANDS
