@@ -12,15 +12,16 @@ from jax import Array
 from jaxmpc.arrays import Reals, as_weight, host_array
 from jaxmpc.checks import fail, number, require_kind, require_shape, require_symmetric_psd, whole
 from jaxmpc.closed_loop.feedback import one_state
-from jaxmpc.closed_loop.robot_controller import FORCES
+from jaxmpc.closed_loop.robot_controller import FORCES, softened_limits
 from jaxmpc.mpc.controller import zeros_of
 from jaxmpc.mpc.plan import Control, Plan, WarmStart, applied, require_before
-from jaxmpc.mpc.problem import MPC, Soft, as_tuple, soften
+from jaxmpc.mpc.problem import MPC, Soft, as_tuple
 from jaxmpc.mpc.rows import layout
 from jaxmpc.mpc.stagewise.solve import solve_stagewise
 from jaxmpc.pytrees import prepared_pytree, static
 from jaxmpc.qp.admm import ADMM, DEFAULT
 from jaxmpc.qp.linalg import arrays, floating_dtype
+from jaxmpc.robots.force_limits import force_limits
 from jaxmpc.robots.gaits import Gait
 from jaxmpc.sets.convex_sets import Box
 
@@ -103,7 +104,11 @@ class GaitController:
         )  # fmt: skip
         solver = DEFAULT if solver is None else solver
         solver = replace(solver, iterations=0) if solver.iterations is None else solver
-        vars(self).update(gait=arrays(gait), mpc=arrays(soften(limits, rho)), rho=rho)
+        with jax.ensure_compile_time_eval():
+            forces = force_limits(robot, np.asarray(robot.state(gait.states[0])), gait.inputs)
+        if forces is not None:
+            limits = replace(limits, outputs=replace(forces, stages=tuple(range(horizon))))
+        vars(self).update(gait=arrays(gait), mpc=arrays(softened_limits(limits, rho)), rho=rho)
         vars(self).update(solver=arrays(solver), cost_to_go=jnp.asarray(P), horizon=horizon)
         self.problem(jnp.int32(0)).validate()
 

@@ -441,7 +441,7 @@ def as_model(robot: Any, exact: bool = True, numbers: Mapping[str, Any] | None =
 FORCES = 100
 
 
-def _softened(mpc: MPC, rho: Reals) -> MPC:
+def softened_limits(mpc: MPC, rho: Reals) -> MPC:
     """Return the problem with soft state limits, outputs and terminal rows, and limits of forces
     that weigh more."""
     outputs = as_tuple("outputs", mpc.outputs, Outputs)
@@ -493,7 +493,7 @@ def _prepared(given: RobotController, solver: ADMM) -> dict[str, Any]:
     if stands(robot) and linearize != "set-point":
         what = f"{linearize!r} of a robot whose feet stand, whose friction cones are of one model"
         fail("linearize", what, 'Give linearize="set-point"')
-    soft = _softened(mpc, given.rho)
+    soft = softened_limits(mpc, given.rho)
     if linearize == "set-point":
         return {"soft": arrays(soft), "fixed": Controller(soft, solver), "scale": None}
     if linearize == "trajectory":

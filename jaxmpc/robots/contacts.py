@@ -43,8 +43,9 @@ from jaxmpc.robots.mujoco_access import equalities, mujoco, names, number_of
 from jaxmpc.robots.parameters import require_numbers
 from jaxmpc.robots.physics import RK4, Physics, in_force
 
-# Distances (m) of feet from the ground up to which they are looked for, and up to which they touch.
-_NEAR, _TOUCHING = 0.05, 0.005
+# Distances of feet from the ground, in their radius, up to which they are looked for, and up to
+# which they touch.
+_NEAR, _TOUCHING = 2.5, 0.25
 # Part of the file's friction that plans count on: what the model leaves out needs the rest.
 _FRICTION = 0.8
 # Smallest motion of a foot, relative to the largest, that counts as one.
@@ -90,12 +91,18 @@ class Feet:
         frames, coefficients, rates = [], [], []
         for name, geom in zip(feet, geoms, strict=True):
             contact, sign = _ground_contact(model, data, geom)
-            if contact is None or contact.dist > _TOUCHING:
-                away = "far" if contact is None else f"{contact.dist:.3g} m"
+            radius = model.geom_size[geom, 0]
+            if contact is None or contact.dist > _TOUCHING * radius:
+                away = "far" if contact is None else f"{contact.dist / radius:.3g} of its radius"
                 problem = f"geom {name} is {away} from the ground at home"
                 fail("feet", problem, "Give a home= in which the feet touch the ground")
+            if contact.dim == 1 and friction != 0:
+                problem = f"geom {name} touches the ground without friction (condim 1)"
+                fail("feet", problem, "Write condim 3 in the file, or give friction=0")
             frames.append(np.reshape(contact.frame, (3, 3)) * [[sign], [1], [1]])
-            coefficients.append(_FRICTION * contact.friction[0] if friction is None else friction)
+            # Of a pair whose tangents differ the smaller one.
+            coefficient = _FRICTION * contact.friction[:2].min()
+            coefficients.append(coefficient if friction is None else friction)
             rates.append(_rate(model, contact))
         return cls(
             names=tuple(feet),
@@ -158,7 +165,7 @@ def _foot(model: "mujoco.MjModel", name: str) -> int:
 def _with_margins(model: "mujoco.MjModel", geoms: np.ndarray) -> "mujoco.MjModel":
     """Return the model, whose contacts are found also where these geoms are near."""
     near = copy.deepcopy(model)
-    near.geom_margin[geoms] = _NEAR
+    near.geom_margin[geoms] = _NEAR * model.geom_size[geoms, 0]
     return near
 
 

@@ -26,6 +26,8 @@ from jaxmpc.robots.mujoco_access import FREE, mujoco, single_joints
 from jaxmpc.robots.robot import Robot
 from jaxmpc.systems.system import LinearSystem
 
+# Control periods of a swing at least: with fewer a foot does not leave the ground.
+_SWING = 3
 # Newton steps of inverse kinematics at most, and the distance (m) that counts as reached.
 _STEPS, _REACHED = 100, 1e-9
 
@@ -98,6 +100,13 @@ def gait(
     feet = tuple(feet)
     standing_robot = robot.standing(feet, friction=friction)
     model = robot.mujoco
+    predictor: Any = standing_robot.predictor
+    normals = predictor.feet.frames[:, 0]
+    if np.abs(normals - [0, 0, 1]).max() > 1e-6:
+        what = f"stands on ground with the normal {np.round(normals[0], 4).tolist()}"
+        fail(
+            "robot", what, "Turn the world of the file so that z is up: the trunk moves in x and y"
+        )
     if not model.njnt or model.jnt_type[0] != FREE or not np.all(single_joints(model)[1:]):
         fail("robot", f"{robot.name} has other joints", "Give a free base, then hinges and slides")
     require_shape("velocity", velocity, (2,), "Along x and y, in m/s")
@@ -125,9 +134,14 @@ def gait(
 
     phases = (np.arange(count)[:, None] / count - starts) % 1.0
     standing = phases < duty - 1e-9
+    for foot, stands in zip(feet, standing.sum(axis=0), strict=True):
+        if stands < 1 or count - stands < _SWING:
+            what = f"{duty}: {foot} stands at {stands} of {count} control periods"
+            cure = f"Let it stand at 1 of them and swing at {_SWING}, by another duty or period"
+            fail("duty", what, cure)
     steps = np.append(velocity, 0.0) * count * robot.dt * duty
     away = steps * _along(phases, duty)[:, :, None] + [0, 0, lift] * _arc(phases, duty)[:, :, None]
-    q = _joints(model, x_rest[: model.nq], feet, places + away)
+    q = _joints(robot, x_rest[: model.nq], feet, places + away)
     joints = q[:, 7:]
     speeds = (np.roll(joints, -1, axis=0) - np.roll(joints, 1, axis=0)) / (2 * robot.dt)
     v = np.zeros((count, model.nv))
@@ -197,12 +211,13 @@ def _places(model: Any, q: np.ndarray, feet: Sequence[str]) -> np.ndarray:
     return np.array([data.geom(name).xpos for name in feet])
 
 
-def _joints(model: Any, home: np.ndarray, feet: Sequence[str], goals: np.ndarray) -> np.ndarray:
+def _joints(robot: Robot, home: np.ndarray, feet: Sequence[str], goals: np.ndarray) -> np.ndarray:
     """Return configurations (P, nq) with the base at home and the feet at `goals` (P, k, 3), by
     Gauss-Newton steps from the one before."""
+    model = robot.mujoco
     data, J = mujoco.MjData(model), np.zeros((3, model.nv))
     geoms = [model.geom(name).id for name in feet]
-    lower, upper = np.where(model.jnt_limited[:, None], model.jnt_range, [-np.inf, np.inf]).T
+    lower, upper = (end[6 : model.nv] for end in robot.state_limits.bounds())
     q, found, at_home = home.copy(), [], _places(model, home, feet)
     for goal in goals:
         for _ in range(_STEPS):
@@ -221,8 +236,8 @@ def _joints(model: Any, home: np.ndarray, feet: Sequence[str], goals: np.ndarray
         problem = ""
         if missed[worst] >= _REACHED:
             problem = f"geom {feet[worst]} stays {missed[worst]:.3g} m from its step"
-        elif np.any((q[7:] < lower[1:]) | (q[7:] > upper[1:])):
-            joint = int(np.argmax(np.maximum(lower[1:] - q[7:], q[7:] - upper[1:]))) + 1
+        elif np.any((q[7:] < lower) | (q[7:] > upper)):
+            joint = int(np.argmax(np.maximum(lower - q[7:], q[7:] - upper))) + 1
             problem = f"joint {model.joint(joint).name} would pass its limits"
         if problem:
             along, up = np.abs(goal - at_home).max(axis=0)[:2].max(), (goal - at_home)[:, 2].max()

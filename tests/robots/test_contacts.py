@@ -227,6 +227,23 @@ def test_weak_motors_hold_no_robot(quadruped):
         weak.set_point()
 
 
+def test_friction_is_that_of_the_contact():
+    """None of condim 1, of a pair with two tangents the smaller; touching is relative to a foot."""
+    text = QUADRUPED.read_text()
+    without = text.replace('condim="3"', "").replace("<geom contype", '<geom condim="1" contype')
+    robot = jm.load_robot(mujoco.MjModel.from_xml_string(without))
+    with pytest.raises(ValueError, match="FL touches the ground without friction .condim 1."):
+        robot.standing(FEET)
+    np.testing.assert_array_equal(robot.standing(FEET, friction=0).predictor.feet.friction, 0)
+    pairs = "".join(
+        f'<pair geom1="floor" geom2="{foot}" condim="3" friction="1 .1 .02 .01 .01"/>'
+        for foot in FEET
+    )
+    text = text.replace("<actuator>", f"<contact>{pairs}</contact><actuator>", 1)
+    robot = jm.load_robot(mujoco.MjModel.from_xml_string(text))
+    np.testing.assert_allclose(robot.standing(FEET).predictor.feet.friction, 0.08)
+
+
 def test_what_cannot_stand_is_named(quadruped):
     """Geoms that are no feet, feet in the air, models that are not stepped."""
     for feet, message in (
@@ -240,7 +257,10 @@ def test_what_cannot_stand_is_named(quadruped):
             quadruped.standing(feet)
     with pytest.raises(ValueError, match="friction: -1"):
         quadruped.standing(FEET, friction=-1)
-    for raised, message in ((0.02, "FL is 0.0199 m from the ground at home"), (0.5, "FL is far")):
+    for raised, message in (
+        (0.02, "FL is 0.9.* of its radius from the ground at home"),
+        (0.5, "FL is far"),
+    ):
         home = quadruped.home + raised * np.eye(quadruped.state_size)[2]
         with pytest.raises(ValueError, match=message):
             replace(quadruped, home=home).standing(FEET)

@@ -1,6 +1,7 @@
 """Gaits: motions against MuJoCo's kinematics, their linear models against those of the feet that
 stand, the periodic LQR against lifted Riccati equations, and a quadruped that trots in MuJoCo."""
 
+import re
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -134,6 +135,9 @@ def test_gaits_without_an_lqr_are_refused():
         ({"offsets": (0.0, 0.5)}, r"offsets: shape \(2,\)"),
         ({"velocity": (4.0, 0.0)}, r"velocity: .*(stays|limits).*smaller velocity"),
         ({"lift": 0.5}, r"lift: .*(stays|limits).*lift"),
+        ({"duty": 0.98}, "duty: 0.98: FL stands at 44 of 44 control periods. Let it .* swing at 3"),
+        ({"duty": 0.95, "period": 0.2}, "duty: 0.95: FL stands at 19 of 20"),
+        ({"duty": 0.05, "offsets": (0.05, 0.55, 0.55, 0.05), "period": 0.1}, "FL stands at 0 of"),
         ({"feet": ("FL", "nose")}, "feet: "),
     ],
 )
@@ -141,6 +145,49 @@ def test_what_is_no_gait_is_named(robot, given, text):
     """Before anything is compiled."""
     with pytest.raises(ValueError, match=text):
         jm.robots.gait(**{"robot": robot, "feet": FEET, **given})
+
+
+def test_grounds_that_are_not_level_are_refused():
+    """The trunk moves along x and y, and feet rise along z."""
+    text = QUADRUPED.read_text()
+    text = text.replace("<option ", '<option gravity="0 -9.81 0" ')
+    text = text.replace(
+        'type="plane"', 'type="plane" quat=".7071067811865476 -.7071067811865476 0 0"'
+    )
+    text = text.replace(
+        'qpos="0 0 .283 1 0 0 0', 'qpos="0 .283 0 .7071067811865476 -.7071067811865476 0 0'
+    )
+    robot = jm.load_robot(mujoco.MjModel.from_xml_string(text))
+    with pytest.raises(ValueError, match=r"normal \[0.0, 1.0, 0.0\]. Turn the world"):
+        jm.robots.gait(robot, FEET)
+
+
+def test_limits_of_the_caller_are_those_of_joints():
+    joints = jm.load_robot(QUADRUPED).home[7:19]
+    free = np.full(6, np.inf)
+    limits = np.append(-free, joints - 0.05), np.append(free, joints + 0.05)
+    robot = jm.load_robot(QUADRUPED, control_period=0.01, position=limits)
+    with pytest.raises(ValueError, match="velocity: joint .* would pass its limits"):
+        jm.robots.gait(robot, FEET)
+
+
+@pytest.mark.long
+def test_servos_keep_their_force_limits():
+    """`forcerange` is a row of the plans; at the first stage the input is within it."""
+    servo = r'<position name="\1" joint="\1" kp="200" kv="1" ctrlrange="-4 4" forcerange="-30 30"/>'
+    text = re.sub(r'<motor name="(\w+)"[^>]*>', servo, QUADRUPED.read_text())
+    robot = jm.load_robot(mujoco.MjModel.from_xml_string(text), control_period=0.01)
+    motion = jm.robots.gait(robot, FEET)
+    Q = np.repeat([100.0, 200, 400, 200, 100, 20, 1, 0.5, 0.02], [1, 1, 1, 2, 1, 12, 3, 3, 12])
+    controller = GaitController(motion, Q, np.ones(12), horizon=8)
+    x = np.array(motion.robot.state(motion.states[0]))
+    x[robot.mujoco.nq + 1] += 0.6  # pushed
+    control = jax.jit(lambda c, x, b: c(x, b))(controller, x, controller.start(x))
+    q, v = x[7:19], x[robot.mujoco.nq + 6 :]
+    force = 200 * (np.asarray(control.u) - q) - v
+    rows = [name for soft in controller.problem(0).soft for name in soft.names]
+    assert sum(name.startswith("force of actuator") for name in rows) == 12
+    assert control.plan.solved and np.abs(force).max() <= 30 + 1e-6 + control.plan.slack[0].max()
 
 
 def test_fixed_bases_have_no_gait():
