@@ -151,8 +151,7 @@ def condensed_plan(mpc: MPC) -> Condensed:
     mpc = replace(mpc, disturbance=with_vertices(mpc.disturbance))
     sides = tightened_by(mpc, section, found, gain)
     placed = [
-        replace(b, lower=np.asarray(low), upper=np.asarray(high))
-        for b, (low, high) in zip(found, sides, strict=True)
+        replace(b, lower=low, upper=high) for b, (low, high) in zip(found, sides, strict=True)
     ]
     require_room(mpc, placed)
     return _tube(*arrays((condense(plain), mpc, gain, section)))
@@ -178,7 +177,10 @@ def tube_section(mpc: MPC) -> Zonotope:
     """Return the cross-section S of a tube. Raises ValueError where dynamics, gain or disturbances
     are traced, and as `minimal_robust_invariant_set`."""
     if not concrete(mpc.system, mpc.disturbance, mpc.disturbance_matrix, mpc.gain):
-        cure = "Make a Controller outside of jit and grad and give it as an argument"
+        cure = (
+            "Give gain=K (None is the LQR of Q and R, traced as they are), else make a Controller "
+        )
+        cure += "outside of jit and grad and give it as an argument"
         fail("policy", "'tube' beside traced dynamics, gain or disturbances", cure)
     gain, plant = np.asarray(feedback_gain(mpc), float), replace(mpc.system, c=None)
     A, B, _ = host_matrices(plant)

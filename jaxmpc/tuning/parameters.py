@@ -122,17 +122,25 @@ class Parameter:
         raw = jnp.asarray(raw)
         theta = jnp.asarray(self._free(self.value), raw.dtype).at[self.train].set(raw)
         if self.domain == "positive":
-            return jnp.exp(theta)
+            return _positive(theta)
         if self.domain == "interval":
             lower, upper = (jnp.asarray(end, raw.dtype) for end in (self.lower, self.upper))
-            return lower + (upper - lower) * jax.nn.sigmoid(theta)
+            value = lower + (upper - lower) * jax.nn.sigmoid(theta)
+            return jnp.clip(value, jnp.nextafter(lower, upper), jnp.nextafter(upper, lower))
         if self.domain == "diagonal":
-            return _diagonal(jnp.exp(theta))
+            return _diagonal(_positive(theta))
         if self.domain == "definite":
-            scales = jnp.exp(jnp.diagonal(theta, axis1=-2, axis2=-1))
+            scales = _positive(jnp.diagonal(theta, axis1=-2, axis2=-1), 0.5)
             L = jnp.tril(theta, -1) + _diagonal(scales)
             return jnp.matmul(L, L.swapaxes(-1, -2), precision="highest")
         return theta
+
+
+def _positive(theta: Array, power: float = 1.0) -> Array:
+    """Return exp θ within the positive numbers to this power, however far a step has gone."""
+    numbers = jnp.finfo(theta.dtype)
+    least, most = np.log(float(numbers.tiny)), np.log(float(numbers.max))
+    return jnp.exp(jnp.clip(theta, power * least + 1, power * most - 1))
 
 
 Parameters = Mapping[str, Parameter]

@@ -306,6 +306,33 @@ def test_forms_of_one_set_of_disturbances():
     np.testing.assert_allclose(each[2], each[0], atol=1e-8)
 
 
+def test_traced_limits_of_a_tube():
+    """Under jit the same plan, and derivatives by differences; the LQR of traced weights is refused
+    with what helps."""
+    system = jm.LinearSystem([[1, 0.2], [0, 1]], [[0.02], [0.2]])
+    gain = jm.lqr(system, np.eye(2), np.eye(1)).K
+
+    def mpc(h, q=1.0, gain=gain):
+        return jm.MPC(
+            system, q * np.eye(2), np.eye(1), 4, states=jm.Box(-h, h), inputs=jm.Box([-1], [1]),
+            disturbance=jm.Box([-0.01] * 2, [0.01] * 2), policy="tube", gain=gain,
+        )  # fmt: skip
+
+    with enable_x64():
+        x, h, step = np.array([0.4, 0.4]), np.array([0.57, 0.5]), 1e-6
+        cost = lambda h: jm.solve(mpc(h), x).cost
+        assert jm.solve(mpc(h), x).solved
+        np.testing.assert_allclose(jax.jit(cost)(h), cost(h), rtol=1e-9)
+        wanted = [(cost(h + step * e) - cost(h - step * e)) / (2 * step) for e in np.eye(2)]
+        found = jax.grad(cost)(h)
+        assert np.abs(wanted).min() > 1
+        np.testing.assert_allclose(found, wanted, rtol=1e-6)
+        slope = jax.grad(lambda q: jm.solve(mpc(h, q), x).cost)(1.0)
+        assert np.isfinite(slope)
+        with pytest.raises(ValueError, match="traced dynamics.*Give gain=K .None is the LQR"):
+            jax.grad(lambda q: jm.solve(mpc(h, q, None), x).cost)(1.0)
+
+
 @pytest.mark.slow
 def test_tubes_keep_all_limits():
     """Under every sequence by u = inputs + K (x − states); the undisturbed plan is one of the

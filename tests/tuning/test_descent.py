@@ -1,5 +1,6 @@
 """Gradient descent with guards: answer, steps back, checkpoints. Domains of parameters."""
 
+import dataclasses
 import importlib
 import os
 import signal
@@ -9,6 +10,7 @@ import time
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
@@ -323,3 +325,22 @@ def test_masks_hold_entries():
 def test_bad_parameters(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("theta", [-1e6, -100.0, 100.0, 1e6])
+def test_parameters_stay_in_their_domains(dtype, theta):
+    """However far a step goes: the value can be the start of the next search."""
+    with jax.enable_x64(dtype == np.float64):
+        for parameter in (
+            Parameter(0.5, "interval", lower=0.1, upper=0.7),
+            Parameter(0.5, "positive"),
+            Parameter(np.diag([0.5, 2.0]), "diagonal"),
+            Parameter(np.diag([0.5, 2.0]), "definite"),
+        ):
+            raw = np.where(np.arange(parameter.raw().size) == 0, theta, parameter.raw())
+            value = np.asarray(parameter.at(jnp.asarray(raw, dtype)), np.float64)
+            again = dataclasses.replace(parameter, value=value)
+            assert np.isfinite(again.raw()).all()
+            slope = jax.jacfwd(parameter.at)(jnp.asarray(raw, dtype))
+            assert np.isfinite(slope).all()
