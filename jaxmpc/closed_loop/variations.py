@@ -120,6 +120,9 @@ def plant_numbers(robot: Robot, factors: Mapping[str, np.ndarray]) -> dict[str, 
             found[quantity] = factor
             continue
         value = _number(robot, field)
+        if np.shape(factor)[1:] != (len(value),):
+            cure = f"Give (B, {len(value)}), one for each entry of {field}, for B robots"
+            fail(f"factors[{quantity!r}]", f"shape {np.shape(factor)}", cure)
         _require_there(robot, quantity, field, np.arange(len(value)))
         found[field] = factor.reshape(*factor.shape, *(1,) * (value.ndim - 1)) * value
         if quantity == "mass":

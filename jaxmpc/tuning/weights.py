@@ -12,7 +12,7 @@ import optax
 
 from jaxmpc.arrays import Reals, numpy_array
 from jaxmpc.batches import chosen_devices
-from jaxmpc.checks import fail, generator, nearest, whole
+from jaxmpc.checks import fail, generator, nearest, require_shape, whole
 from jaxmpc.closed_loop.simulation import Conditions, Run, initial_states, require_variations
 from jaxmpc.mpc.problem import MPC, harden
 from jaxmpc.qp.admm import ADMM
@@ -198,11 +198,17 @@ def _starting_points(
 ) -> list[Parameters]:
     """Return the parameters at each starting point, the given one first."""
     if isinstance(starts, Sequence) and not isinstance(starts, str):
-        for given in starts:
+        for i, given in enumerate(starts):
             for name in given if isinstance(given, Mapping) else [str(given)]:
                 if name not in parameters:
                     cure = f"{nearest(str(name), parameters)}Give values of {', '.join(parameters)}"
                     fail("starts", f"holds {name!r}, which is no parameter", cure)
+                where, own = f"starts[{i}][{name!r}]", parameters[name]
+                require_shape(where, given[name], own.value.shape, "As the parameter's value")
+                try:
+                    replace(own, value=given[name])
+                except ValueError as error:
+                    raise ValueError(str(error).replace("value", where, 1)) from None
         return [parameters, *(moved(parameters, given) for given in starts)]
     random, theta = generator(seed), raw(parameters)
     draw = lambda: {name: v + random.normal(size=v.shape) for name, v in theta.items()}

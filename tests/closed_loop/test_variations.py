@@ -5,6 +5,7 @@ import pytest
 
 import jaxmpc as jm
 from jaxmpc.closed_loop import randomised
+from jaxmpc.closed_loop.variations import plant_numbers
 
 ALL = dict(
     mass=(0.9, 1.1), damping=(0.8, 1.2), armature=(0.5, 2.0), gear=(0.7, 1.0), payload=(0.0, 1.0)
@@ -88,3 +89,8 @@ def test_bad_ranges_are_named(arm):
         randomised(arm, 0, mass=(0.9, 1.1))
     with pytest.raises(ValueError, match="robot: is a LinearSystem. Give a jm.robots.Robot"):
         randomised(jm.LinearSystem([[1.0]], [[1.0]]), 3, mass=(0.9, 1.1))
+
+
+def test_factors_of_other_shapes_are_named(arm):
+    with pytest.raises(ValueError, match=r"factors\['mass'\]: shape \(4,\). Give \(B, "):
+        plant_numbers(arm, {"mass": np.ones(4)})

@@ -373,6 +373,9 @@ def test_loss_in_closed_form(x64):
         ({"loss": "a"}, "loss: is a str. Give a function of a Run"),
         ({"design_loss": "a"}, "design_loss: is a str. Give a function of an MPC"),
         ({"steps": 0}, "steps"),
+        ({"starts": [{"S": 1.0}]}, "starts: holds 'S', which is no parameter"),
+        ({"starts": [{"Q": 3.0}]}, r"starts\[0\]\['Q'\]: shape \(\)"),
+        ({"starts": [{}, {"Q": -np.eye(2)}]}, r"starts\[1\]\['Q'\]: .*definite"),
     ],
 )
 def test_bad_arguments_before_any_compile(more, message, monkeypatch):
