@@ -1,9 +1,10 @@
-"""Arms with unknown payloads that come to rest at a target: offset-free MPC against plain MPC.
+"""Arms with unknown payloads that come to rest at a target: three MPCs side by side.
 
 Each arm begins at rest somewhere about its home and carries a payload that its controller does not
-know. Both controllers have one linear model, that of the set-point, and soft limits; the
+know. "plain" and "offset-free" have one linear model, that of the set-point, and soft limits; the
 offset-free one has a Kalman filter beside it, which estimates a disturbance of each joint's torque.
-Printed for each:
+"payload" has a linear model at each state and an extended Kalman filter, which estimates the
+payload: its models, and the torques of the target, have the estimate. Printed for each:
 
     kept        share of arms that keep all position and velocity limits all the time, to 1e-6
     worst       largest violation of a limit (rad or rad/s)
@@ -43,7 +44,8 @@ COLUMNS = ("kept", "worst", "error", "largest", "soft", "solved", "seconds")
 class Settings:
     """loops: arms. seconds: of motion. spread: of the starts, in fractions of the way from home to
     the limits. payload: the largest, kg. noise: standard deviation of what is measured, rad and
-    rad/s. drift: by how much an estimated torque moves in one time step, in torque limits."""
+    rad/s. drift: by how much an estimated torque moves in one time step, in torque limits.
+    controllers: which of them run."""
 
     robot: str = "arm7"
     loops: int = 256
@@ -55,6 +57,7 @@ class Settings:
     horizon: int = 20
     chunk: int | None = None
     seed: int = 0
+    controllers: tuple[str, ...] = ("offset-free", "plain", "payload")
 
 
 def run(s: Settings) -> Iterator[tuple[str, dict[str, float]]]:
@@ -81,9 +84,22 @@ def run(s: Settings) -> Iterator[tuple[str, dict[str, float]]]:
     }
     x0s, _ = draw_robots(robot, s.loops, s.seed, spread=s.spread)
     steps = round(s.seconds / robot.dt)
-    for name, controller in (("offset-free", free), ("plain", plain)):
+    load = Disturbance("payload", 1e-3 * s.payload, initial=s.payload)
+    spread = np.repeat([1e-5, 1e-3], nv)
+    estimator = KalmanFilter(
+        robot, spread, s.noise, C=np.eye(robot.n), initial=1e-3, disturbance=load
+    )
+    knowing = jm.RobotController(robot, mpc, linearize="state")
+    every: tuple[tuple[str, Any, KalmanFilter | None], ...] = (
+        ("offset-free", free, None),
+        ("plain", plain, None),
+        ("payload", knowing, estimator),
+    )
+    for name, controller, beside in every:
+        if name not in s.controllers:
+            continue
         begin = time.perf_counter()
-        runs = jm.simulate_many(controller, robot, x0s, steps, **given)
+        runs = jm.simulate_many(controller, robot, x0s, steps, observer=beside, **given)
         seconds = time.perf_counter() - begin
         worst = runs.violation.max(axis=1)
         error = np.abs(runs.states[:, -1, :nv] - x[:nv]).max(axis=1)
