@@ -178,7 +178,7 @@ def test_bad_trade_offs_before_any_compile(more, message, monkeypatch):
         (2.5, "starts: 2.5"),
         ([{"gaol": [0.0, 0.0]}], "starts: holds 'gaol'.*goal"),
         ([[0.0, 0.0]], "starts: holds"),
-        ([{"goal": [np.nan, 0.0]}], "value"),
+        ([{"goal": [np.nan, 0.0]}], r"starts\[0\]\[.goal.\]: holds NaN"),
     ],
 )
 def test_bad_starting_points_before_any_compile(starts, message, monkeypatch):
