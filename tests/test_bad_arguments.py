@@ -308,7 +308,7 @@ CALLS = [
     ),
     ("constrain_initial: 'no'. Give True or False", lambda: mpc(constrain_initial="no").validate()),
     (
-        "constrained_stages: (True, False). Of a mask give np.flatnonzero(mask)",
+        "constrained_stages: (True, False). Give np.flatnonzero(mask) in place",
         lambda: mpc(constrained_stages=[True, False]).validate(),
     ),
     (

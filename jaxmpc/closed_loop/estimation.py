@@ -13,6 +13,7 @@ from jax import Array
 from jaxmpc.checks import (
     concrete,
     fail,
+    nearest,
     require_finite,
     require_kind,
     require_real,
@@ -23,7 +24,7 @@ from jaxmpc.mpc.stagewise.nonlinear import NonlinearMPC, linear_model
 from jaxmpc.pytrees import named_pytree, pytree, static
 from jaxmpc.qp.linalg import arrays, matmul, solve, symmetric, symmetric_root
 from jaxmpc.robots.linear_plant import LinearPlant
-from jaxmpc.robots.parameters import PAYLOAD, require_numbers
+from jaxmpc.robots.parameters import FIELDS, NONNEGATIVE, OF_PLANTS, PAYLOAD, require_numbers
 from jaxmpc.robots.robot import Robot, RobotModel
 from jaxmpc.systems.riccati import least_reached, lqr
 from jaxmpc.systems.system import LinearSystem, host_matrices
@@ -144,12 +145,14 @@ class Disturbance:
                    "actuator_gear"), M (its entries, k): it is that of the model plus M d.
     process: of w, of one time step, in the unit of d; as in `Noise`. The larger, the sooner a
         change of d is followed, and the more measurement noise is taken for one.
-    matrix M: None for one d for each input, output, state or entry.
+    matrix M: None for one d for each input, output, state or entry; of the gear of a motor
+        np.eye(6, 1).
     initial: of the error of the first estimate d = 0, where the filter has `initial`.
 
-    No more disturbances than measured outputs can be told from each other. With as many, and with
-    any model errors that leave the loop stable, `OffsetFreeController` has no steady-state error
-    in the outputs that it tracks.
+    No more disturbances of inputs, outputs and states than measured outputs can be told from each
+    other; numbers of a model are told apart by motion. With as many, and with any model errors that
+    leave the loop stable, `OffsetFreeController` has no steady-state error in the outputs that it
+    tracks.
     """
 
     kind: str = static()
@@ -211,7 +214,7 @@ class KalmanFilter:
         if not isinstance(self.model, Robot):
             self.model.validate()
         n = self.model.n
-        if self.C is None and n % 2 and not isinstance(self.model, Robot):
+        if self.C is None and n % 2 and _robot_model(self.model) is None:
             fail("observer.C", f"is None with {n} states", "Say which outputs are measured")
         p = self.p if self.C is None or np.ndim(self.C) == 2 else 1
         if self.C is not None:
@@ -254,7 +257,7 @@ class KalmanFilter:
             rows = sizes[one.kind] if one.kind in KINDS else self._entries(f"{name}.kind", one.kind)
             M = whole_array(np.eye(rows) if one.matrix is None else one.matrix)
             if M.ndim != 2 or M.shape[0] != rows or not M.shape[1]:
-                cure = f"Give ({rows}, k), a row for each {one.kind}, or None"
+                cure = f"Give ({rows}, k), a row for each entry of {one.kind}, or None"
                 fail(f"{name}.matrix", f"shape {M.shape}", cure)
             require_finite(f"{name}.matrix", M)
             k = M.shape[1]
@@ -270,7 +273,7 @@ class KalmanFilter:
                 fail(f"{name}.initial", "is None, and observer.initial is given", "Give it too")
             spreads = (whole_array(one.process), M, whole_array(one.initial))
             found.append(Disturbance(one.kind, *spreads))
-        k = sum(np.shape(one.matrix)[1] for one in found)
+        k = sum(np.shape(one.matrix)[1] for one in found if one.kind in KINDS)
         if k > p:
             what = f"has {k} disturbances, and {p} outputs are measured"
             fail("observer.disturbance", what, "Give at most one for each measured output")
@@ -283,11 +286,15 @@ class KalmanFilter:
         if model is None:
             cure = f"Give one of {', '.join(KINDS)}; with a Robot as the model also its numbers"
             fail(name, f"{kind!r}", cure)
-        robot = model.robot
-        if kind not in robot.predictor.own and not hasattr(robot.predictor.mjx, kind):
-            require_numbers(robot.predictor, {kind: 0.0})  # names what there is
+        physics = model.robot.predictor
+        if not isinstance(kind, str) or kind not in (*FIELDS, *physics.own):
+            near = nearest(str(kind), (*KINDS, *FIELDS, PAYLOAD))
+            cure = f"{near}Give one of {', '.join(KINDS)}, or a number as in Robot.vary"
+            fail(name, f"{kind!r}", cure)
+        if kind in OF_PLANTS and not physics.limited:
+            fail(name, f"{kind!r}, of which the model has nothing", "Estimate another number")
         value = _number(model, kind)
-        require_numbers(robot.predictor, {kind: value})
+        require_numbers(physics, {kind: value})
         return np.size(value)
 
     @property
@@ -296,13 +303,20 @@ class KalmanFilter:
         return any(one.kind not in KINDS for one in self._each)
 
     def numbers(self, d: Array) -> dict[str, Array]:
-        """Return the numbers of the robot's model that are estimated, by name, where the
-        disturbances are d (k,); for `numbers=` of a `RobotController`."""
-        found, model = {}, _robot_model(self.model)
-        for kind in {one.kind for one in self._each}.difference(KINDS):
-            assert model is not None  # `prepared` says so
+        """Return the numbers of the robot's model, the model's own and those that are estimated, by
+        name, where the disturbances are d (k,); for `numbers=` of a `RobotController`. Those that
+        cannot be negative are held at 0."""
+        model = _robot_model(self.model)
+        assert model is not None  # `prepared` says so
+        found = dict(model.numbers)
+        for kind in dict.fromkeys(one.kind for one in self._each if one.kind not in KINDS):
             M, own = (jnp.asarray(v, d.dtype) for v in (self.matrix(kind), _number(model, kind)))
-            found[kind] = own + matmul(M, d).reshape(own.shape)
+            value = own + matmul(M, d).reshape(own.shape)
+            if (
+                kind in NONNEGATIVE
+            ):  # with the derivative of what d says, by which it leaves 0 again
+                value = value + jax.lax.stop_gradient(jnp.maximum(value, 0) - value)
+            found[kind] = value
         return found
 
     def _informed(self, d: Array) -> Any:
@@ -310,7 +324,7 @@ class KalmanFilter:
         model = _robot_model(self.model)
         if model is None or not self.estimates_numbers:
             return self.model
-        return replace(model, numbers={**model.numbers, **self.numbers(d)})
+        return replace(model, numbers=self.numbers(d))
 
     @property
     def linear_model(self) -> LinearSystem:
@@ -394,7 +408,8 @@ class KalmanFilter:
         if self.C is not None:
             return np.shape(self.C)[0]
         # Positions; a robot's activations come after its velocities.
-        return self.model.mujoco.nv if isinstance(self.model, Robot) else self.model.n // 2
+        model = _robot_model(self.model)
+        return self.model.n // 2 if model is None else model.robot.mujoco.nv
 
     def outputs(self, xi: Array) -> Array:
         """Return C ξ (p,)."""

@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.arrays import Reals, as_weight, host_array
-from jaxmpc.checks import concrete, fail, number, require_untraced, whole
+from jaxmpc.checks import concrete, fail, number, require_kind, require_untraced, whole
 from jaxmpc.closed_loop.feedback import first_row, one_state
 from jaxmpc.closed_loop.nonlinear_controller import (
     at_rest,
@@ -369,8 +369,9 @@ class RobotController:
 
         forecast: as in `solve`, in ξ, with linearize="set-point" only.
         numbers: of the robot's model, as in `Robot.vary`, in place of the file's, not with
-            "set-point": an estimated payload, for one. To input_reference is added what holds
-            (the first row of) the reference under them.
+            "set-point": an estimated payload, for one. Where both references are given, what
+            holds the (first row of the) reference under them is added to input_reference, and to
+            the activations of the reference.
         """
         x = one_state(self, x)
         require_before(before)
@@ -379,16 +380,18 @@ class RobotController:
             "previous_input": previous_input,
         }
         xi = self.coordinates(x)
+        if numbers is not None:
+            require_kind("numbers", numbers, Mapping, cure='Give {"payload": ...}')
+        if numbers and not self.takes_numbers:
+            what = f"given with linearize={self.linearize!r} of a {type(self.robot).__name__}"
+            fail("numbers", what, 'Give linearize="state" or "trajectory" and a Robot')
         if self.fixed is not None:
             return self.fixed(xi, before, reference, **known, forecast=forecast)
         if forecast is not None:
             what = f"given with linearize={self.linearize!r}"
             fail("forecast", what, 'Give linearize="set-point", or leave it out')
         if numbers:
-            if not self.takes_numbers:
-                what = f"given with linearize={self.linearize!r} of a {type(self.robot).__name__}"
-                fail("numbers", what, 'Give linearize="state" or "trajectory" and a Robot')
-            known["input_reference"] = self._held(reference, input_reference, numbers)
+            reference, known["input_reference"] = self._held(reference, input_reference, numbers)
         if self.linearize == "trajectory":
             search = {"iterations": self.sqp_steps, "hessian": self.hessian, "scale": self.scale}
             problem = NonlinearMPC(self.soft, as_model(self.robot, self.exact, numbers), self.tasks)
@@ -399,27 +402,33 @@ class RobotController:
         start = None if memory is None else memory.shifted(rows, memory.inputs[-1])
         inputs = at_rest(self.soft, xi, input_reference)[1] if memory is None else memory.inputs
         about = limited(self.soft.inputs, inputs[0])
-        with_numbers = (
-            {"numbers": numbers} if numbers else {}
-        )  # which plants of users need not take
+        with_numbers = {"numbers": numbers} if numbers else {}  # a LinearPlant takes none
         system = self.robot.linearize(x, about, exact=self.exact, **with_numbers)
         known |= {"previous_input": last, "scale": self.scale}
         mpc = replace(self.soft, system=system)
         plan = solve_stagewise(mpc, xi, reference, self.solver, start, **known)
         return applied(self.soft, rows, plan, memory, last)
 
-    def _held(self, reference: Any, input_reference: Any, numbers: Mapping[str, Any]) -> Any:
-        """Return input_reference plus the input that makes up, at the first row of the reference,
-        for what these numbers change in the next state: least squares, exact where each joint has
-        a motor."""
+    def _held(
+        self, reference: Any, input_reference: Any, numbers: Mapping[str, Any]
+    ) -> tuple[Any, Any]:
+        """Return both references, activations and inputs changed by what makes up, at their first
+        rows, for the change of the next state by these numbers: least squares, exact where each
+        joint has a motor."""
         if reference is None or input_reference is None:
-            return input_reference
+            return reference, input_reference
         r, s = (first_row(part, self.dtype) for part in (reference, input_reference))
-        r = r[: self.robot.n]
+        n, na = self.robot.n, self.robot.mujoco.na
         file, told = (RobotModel(self.robot, dict(v), exact=False) for v in ({}, numbers))
-        B: Any = told.linearize(r, s).B
-        lost = matmul(B.T, file.step(r, s) - told.step(r, s))
-        return jnp.asarray(input_reference, self.dtype) + solve(ridged(matmul(B.T, B)), lost)
+        system: Any = told.linearize(r[:n], s)
+        # At rest activations α stay: (A − 1) α + B u makes up for what is lost.
+        M = jnp.concatenate([(system.A - jnp.eye(n, dtype=r.dtype))[:, n - na :], system.B], axis=1)
+        lost = file.step(r[:n], s) - told.step(r[:n], s)
+        by = solve(ridged(matmul(M.T, M)), matmul(M.T, lost))
+        whole = jnp.zeros_like(r).at[n - na : n].set(by[:na])
+        return jnp.asarray(reference, self.dtype) + whole, (
+            jnp.asarray(input_reference, self.dtype) + by[na:]
+        )
 
     @property
     def problem(self) -> NonlinearMPC:

@@ -174,7 +174,9 @@ class StoredMap:
             np.concatenate([old.bound_normal, normals]),
             np.concatenate([old.bound_offset, offsets]),
         )
-        if told:
+        for other in (w for w in told if not str(w.message).startswith("refine:")):
+            warnings.warn_explicit(other.message, other.category, other.filename, other.lineno)
+        if any(str(w.message).startswith("refine:") for w in told):
             low, high = joined.bounds.volume_bounds()
             if gap * high < high - low < np.inf:
                 warn_of_gap((high - low) / high, gap)

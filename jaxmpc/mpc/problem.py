@@ -277,6 +277,8 @@ class MPC:
         store_floats(self, *weights, "prestabilise", "input_rate_limit")
         store_floats(self, "disturbance_matrix", "gain")
         store_stages(self, "constrained_stages")
+        if isinstance(self.control_horizon, np.ndarray) and not self.control_horizon.ndim:
+            object.__setattr__(self, "control_horizon", self.control_horizon.item())
         if isinstance(self.control_horizon, list | range | np.ndarray):
             store_stages(self, "control_horizon")
         for name, cure in MADE_BY.items():
@@ -736,8 +738,10 @@ def require_stages(name: str, stages: Any, last: int) -> None:
         return
     whole = _whole_numbers(stages) and all(0 <= k <= last for k in stages)
     if not whole or len(set(stages)) != len(stages):
-        mask = "Of a mask give np.flatnonzero(mask): " if any(k is True for k in stages) else ""
-        fail(name, f"{stages!r}", f"{mask}Give a tuple of different stages from 0 to {last}")
+        cure = f"Give a tuple of different stages from 0 to {last}"
+        if any(k is True for k in stages):
+            cure = "Give np.flatnonzero(mask) in place of a mask"
+        fail(name, f"{stages!r}", cure)
 
 
 def _stage_by_stage(name: str, part: Any, at: StagesOf | None) -> Iterator[tuple[str, Any]]:

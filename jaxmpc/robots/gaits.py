@@ -102,8 +102,9 @@ def gait(
     model = robot.mujoco
     predictor: Any = standing_robot.predictor
     normals = predictor.feet.frames[:, 0]
-    if np.abs(normals - [0, 0, 1]).max() > 1e-6:
-        what = f"stands on ground with the normal {np.round(normals[0], 4).tolist()}"
+    tilts = np.abs(normals - [0, 0, 1]).max(axis=1)
+    if tilts.max() > 1e-6:
+        what = f"stands on ground with the normal {np.round(normals[tilts.argmax()], 4).tolist()}"
         fail(
             "robot", what, "Turn the world of the file so that z is up: the trunk moves in x and y"
         )
@@ -137,7 +138,10 @@ def gait(
     for foot, stands in zip(feet, standing.sum(axis=0), strict=True):
         if stands < 1 or count - stands < _SWING:
             what = f"{duty}: {foot} stands at {stands} of {count} control periods"
-            cure = f"Let it stand at 1 of them and swing at {_SWING}, by another duty or period"
+            cure = (
+                f"Let it stand at 1 of them and swing at {_SWING} at least: another duty, a longer "
+            )
+            cure += "period or a shorter control_period"
             fail("duty", what, cure)
     steps = np.append(velocity, 0.0) * count * robot.dt * duty
     away = steps * _along(phases, duty)[:, :, None] + [0, 0, lift] * _arc(phases, duty)[:, :, None]

@@ -126,7 +126,10 @@ class Parameter:
         if self.domain == "interval":
             lower, upper = (jnp.asarray(end, raw.dtype) for end in (self.lower, self.upper))
             value = lower + (upper - lower) * jax.nn.sigmoid(theta)
-            return jnp.clip(value, jnp.nextafter(lower, upper), jnp.nextafter(upper, lower))
+            tiny = jnp.finfo(raw.dtype).tiny  # smaller numbers are flushed to 0
+            least = jnp.where(lower == 0, tiny, jnp.nextafter(lower, upper))
+            most = jnp.where(upper == 0, -tiny, jnp.nextafter(upper, lower))
+            return jnp.clip(value, least, most)
         if self.domain == "diagonal":
             return _diagonal(_positive(theta))
         if self.domain == "definite":

@@ -352,6 +352,71 @@ def test_numbers_of_a_robot_are_estimated(loaded):
     np.testing.assert_allclose(found, [changes[k] for k in both], rtol=1e-3)
 
 
+def test_numbers_that_cannot_be_negative_are_held_at_zero(loaded):
+    """An estimate below 0, as noise gives one of no payload, is no error; and it comes back."""
+    load = Disturbance("payload", 1e-3, initial=0.5)
+    observer = KalmanFilter(loaded, 1e-6, 1e-5, initial=1e-3, disturbance=load).prepared()
+    belief = Belief(jnp.array([0.3, 0.0, -1.0]), jnp.diag(jnp.array([1e-6, 1e-6, 0.25])))
+    assert observer.numbers(belief.mean[2:]) == {"payload": 0.0}
+    plant, u, x = loaded.vary(payload=0.4), jnp.ones(1), jnp.array([0.3, 0.0])
+    predicted = observer.predicted(belief, u)  # outside jit, where numbers are checked
+    np.testing.assert_allclose(predicted.mean[:2], loaded.step(x, u), atol=1e-12)
+    step = jax.jit(lambda b, x: observer.corrected(observer.predicted(b, u), x[:1]))
+    for _ in range(40):
+        x = plant.step(x, u)
+        belief = step(belief, x)
+    np.testing.assert_allclose(belief.mean[2], 0.4, rtol=0.02)
+
+
+def test_one_output_tells_several_numbers(loaded):
+    loads = tuple(Disturbance(kind, 1e-3, initial=0.5) for kind in ("payload", "dof_damping"))
+    KalmanFilter(loaded, 1e-6, 1e-5, C=[[1, 0]], initial=1e-3, disturbance=loads).prepared()
+    with pytest.raises(ValueError, match="1 outputs are measured|1 output"):
+        KalmanFilter(
+            loaded, 1e-6, 1e-5, C=[[1, 0]], initial=1e-3,
+            disturbance=(Disturbance("state", 1e-3, initial=0.5), *loads),
+        ).prepared()  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        ("inputs", r"disturbance\[0\].kind: 'inputs'. Did you mean input. Give one of input"),
+        (None, r"disturbance\[0\].kind: None"),
+        ("body_massx", "Did you mean body_mass"),
+        ("dof_frictionloss", "dof_frictionloss', of which the model has nothing"),
+    ],
+)
+def test_kinds_of_a_robots_filter_are_named(loaded, kind, message):
+    load = Disturbance(kind, 1e-3, initial=0.5)
+    with pytest.raises(ValueError, match=message):
+        KalmanFilter(loaded, 1e-6, 1e-5, initial=1e-3, disturbance=load).prepared()
+
+
+@pytest.mark.long
+def test_numbers_are_held_through_activations(loaded):
+    """The activation at rest changes with the load too; one linear model takes no numbers."""
+    slow = LOADED.replace("<motor", '<general dyntype="filter" dynprm=".05" gainprm="1"')
+    for text in (slow, LOADED):
+        robot = jm.load_robot(mujoco.MjModel.from_xml_string(text), control_period=0.02)
+        x, u = robot.set_point([1.0])
+        controller = jm.RobotController(robot, jm.robot_mpc(robot, horizon=3, target=[1.0]))
+        r, s = controller._held(robot.coordinates(x), u, {"payload": jnp.asarray(0.7)})
+        at = np.asarray(robot.state(r))
+        after = robot.vary(payload=0.7).step(at, s)
+        np.testing.assert_allclose(after, at, atol=1e-6)
+        assert abs(s[0] - u[0]) > 0.1
+    fixed = jm.RobotController(
+        loaded, jm.robot_mpc(loaded, horizon=3, target=[1.0]), linearize="set-point"
+    )
+    for numbers, message in (
+        ({"payload": 0.7}, "numbers: given with"),
+        ([1.0], "numbers: is a list"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            fixed(np.array([1.0, 0.0]), numbers=numbers)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("linearize", ["state", "trajectory"])
 def test_plans_know_the_estimated_payload(loaded, linearize):

@@ -1134,6 +1134,7 @@ def test_numbers_of_steps_may_be_lists_ranges_and_arrays():
         assert rows.constrained_stages == stages and jm.Outputs(EYE, stages=given).stages == stages
         assert jm.Soft(EYE, stages=given).stages == stages
         rows.validate()
+    assert replace(mpc, control_horizon=np.array(4)).control_horizon == 4
     for given in ([1, 3], np.array([1, 3])):
         blocks = replace(mpc, control_horizon=given)
         blocks.validate()

@@ -334,6 +334,8 @@ def test_parameters_stay_in_their_domains(dtype, theta):
     with jax.enable_x64(dtype == np.float64):
         for parameter in (
             Parameter(0.5, "interval", lower=0.1, upper=0.7),
+            Parameter(0.5, "interval", lower=0.0, upper=1.0),
+            Parameter(-0.5, "interval", lower=-1.0, upper=0.0),
             Parameter(0.5, "positive"),
             Parameter(np.diag([0.5, 2.0]), "diagonal"),
             Parameter(np.diag([0.5, 2.0]), "definite"),

@@ -40,8 +40,11 @@ def _regions(config: configs.Config, mpc: MPC) -> CriticalRegions:
         what = "leave the feasible set unbounded, and a table of regions ends"
         raise config.origin.error(f"limits.x_min, x_max: {what}. Bound every state")
     if regions.tied:
+        key, cure = "mpc.terminal", "Take a terminal set with volume"
+        if mpc.terminal_set is None:
+            key, cure = "limits.x_min", "Let x_min be below x_max, and rows leave room"
         what = "makes the feasible set flat, and no state that is measured lies in it"
-        raise config.origin.error(f"mpc.terminal: {what}. Take a terminal set with volume")
+        raise config.origin.error(f"{key}: {what}. {cure}")
     return regions
 
 
@@ -106,8 +109,9 @@ class Export(ExportOptions):
                 overwrite=self.overwrite,
             )
             summary |= {"iterations": solver.iterations, "tolerance": tolerance}
-        if config.references():
-            rows.append(("reference", "an argument of the function; the code has none"))
+        if config.references() and self.law != "explicit":
+            said = "an argument of the function: what the file says is not in the code"
+            rows.append(("reference", said))
         print(f"{config.name}\n")
         kind = "" if self.law == "jax" else " of text"
         size = lambda path: f"{path.stat().st_size / 1024:.1f} KiB{kind}"
