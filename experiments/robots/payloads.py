@@ -1,10 +1,11 @@
-"""Arms with unknown payloads that come to rest at a target: three MPCs side by side.
+"""Arms with unknown payloads that come to rest at a target: four MPCs side by side.
 
 Each arm begins at rest somewhere about its home and carries a payload that its controller does not
 know. "plain" and "offset-free" have one linear model, that of the set-point, and soft limits; the
 offset-free one has a Kalman filter beside it, which estimates a disturbance of each joint's torque.
-"payload" has a linear model at each state and an extended Kalman filter, which estimates the
-payload: its models, and the torques of the target, have the estimate. Printed for each:
+"state" has a linear model at each state, and knows nothing of the payload; "payload" also has an
+extended Kalman filter, which estimates it: its models, and the torques of the target, have the
+estimate. Printed for each:
 
     kept        share of arms that keep all position and velocity limits all the time, to 1e-6
     worst       largest violation of a limit (rad or rad/s)
@@ -57,7 +58,7 @@ class Settings:
     horizon: int = 20
     chunk: int | None = None
     seed: int = 0
-    controllers: tuple[str, ...] = ("offset-free", "plain", "payload")
+    controllers: tuple[str, ...] = ("offset-free", "plain", "state", "payload")
 
 
 def run(s: Settings) -> Iterator[tuple[str, dict[str, float]]]:
@@ -89,11 +90,12 @@ def run(s: Settings) -> Iterator[tuple[str, dict[str, float]]]:
     estimator = KalmanFilter(
         robot, spread, s.noise, C=np.eye(robot.n), initial=1e-3, disturbance=load
     )
-    knowing = jm.RobotController(robot, mpc, linearize="state")
+    states = jm.RobotController(robot, mpc, linearize="state")
     every: tuple[tuple[str, Any, KalmanFilter | None], ...] = (
         ("offset-free", free, None),
         ("plain", plain, None),
-        ("payload", knowing, estimator),
+        ("state", states, None),
+        ("payload", states, estimator),
     )
     for name, controller, beside in every:
         if name not in s.controllers:
