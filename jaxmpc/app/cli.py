@@ -23,7 +23,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 import tyro
 
 import jaxmpc
-from jaxmpc.app.commands.outcome import Outcome
+from jaxmpc.app.commands.outcome import RECORDS, Outcome
 from jaxmpc.app.options.export import ExportOptions
 from jaxmpc.app.options.info import InfoOptions
 from jaxmpc.app.options.init import InitOptions
@@ -56,8 +56,6 @@ DESCRIPTION = """Constrained MPC in batches, with proofs. Also: jaxmpc --version
 Every command takes --quiet (errors alone), --json (one JSON object in place of tables),
 --format {pdf,svg,png} (pictures in this format beside PNG) and --width {page,column} (of maps, for
 papers). docs/how-to/commands.md tells more."""
-# Files in which commands keep their results as JSON.
-RECORDS = ("summary.json", "tuning.json", "solver.json")
 # What the line of an error begins with.
 ERROR = "jaxmpc: error: "
 # Options of tyro that write a completion script for a shell, and the words that each needs.

@@ -26,7 +26,7 @@ from jaxmpc.qp.linalg import arrays, matmul, solve, symmetric, symmetric_root
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.parameters import FIELDS, NONNEGATIVE, OF_PLANTS, PAYLOAD, require_numbers
 from jaxmpc.robots.robot import Robot, RobotModel
-from jaxmpc.systems.riccati import least_reached, lqr
+from jaxmpc.systems.riccati import UNREACHED, least_reached, lqr
 from jaxmpc.systems.system import LinearSystem, host_matrices
 from jaxmpc.systems.units import balanced, less_identity, natural_units
 
@@ -512,7 +512,7 @@ class KalmanFilter:
                 ("C", least_reached(A.T, C.T), "no output shows", "Measure it"),
                 ("process", least_reached(A, pushed), "no noise moves", "Give it some, or initial"),
             ):
-                if found <= 1e-10:
+                if found <= UNREACHED:
                     fail(f"observer.{argument}", f"{problem} the mode with eigenvalue {mode}", cure)
             P: Any = lqr(LinearSystem(A.T, C.T), W, V).P
             return np.linalg.solve(C @ P @ C.T + V, C @ P).T

@@ -13,7 +13,7 @@ import numpy as np
 import scipy
 
 from jaxmpc.arrays import Reals
-from jaxmpc.checks import fail, number
+from jaxmpc.checks import fail, number, whole
 from jaxmpc.pytrees import pytree, static
 from jaxmpc.sets.convex_sets import Box, ConvexSet, Polytope, as_polytope
 from jaxmpc.sets.disturbances import supports
@@ -99,8 +99,7 @@ def maximal_control_invariant_set(
     Source: Bertsekas 1972, IEEE TAC 17(5), for the recursion; Blanchini 1994, IEEE TAC 39(2),
     for contractive sets; Kerrigan 2000, thesis, Cambridge, sections 2.6 and 3.2.
     """
-    if not (isinstance(max_iterations, int) and max_iterations >= 1):
-        fail("max_iterations", f"{max_iterations!r} is no positive integer", "Give one")
+    whole("max_iterations", max_iterations, 1)
     number("tolerance", tolerance, 0, "Give a relative gap")
     if not 0 < tolerance < 1:
         fail("tolerance", f"{tolerance!r} is not between 0 and 1", "Give a relative gap")

@@ -17,14 +17,13 @@ from jaxmpc.sets.geometry import Flat, affine_hull, framed
 from jaxmpc.sets.invariant import contraction
 from jaxmpc.sets.lp import Program, extent, maximise
 from jaxmpc.sets.predecessors import OneStep, one_step
-from jaxmpc.systems.riccati import least_reached, lqr
+from jaxmpc.systems.riccati import UNREACHED, least_reached, lqr
 from jaxmpc.systems.system import LinearSystem, host_matrices
 
 # A limit counts as kept if it is exceeded by no more than this, relative to the set's extent
 # along the row (to |P| for matrix inequalities). Sets that touch a limit exceed it by rounding.
 _TOUCH = 1e-9
 _EXACT_PRODUCTS = 200_000  # a certificate with no more products is also evaluated in rationals
-_DETECTABLE = 1e-10  # as in `lqr`
 
 
 @dataclass(frozen=True)
@@ -554,11 +553,11 @@ def _weights(
     seen, mode = least_reached((A * unit / unit[:, None]).T, output.T)
     if seen == np.inf:
         sentence = "Every mode decays by itself."
-    elif seen <= _DETECTABLE:
+    elif seen <= UNREACHED:
         sentence = f"Q puts no weight on the mode with eigenvalue {mode}, which does not decay."
     else:
         sentence = f"Every mode that does not decay costs something; the least, eigenvalue {mode}."
-    detectable = bool(seen > _DETECTABLE)
+    detectable = bool(seen > UNREACHED)
     return [*checks, Check("detectability", detectable, seen, "least singular value", sentence)]
 
 

@@ -152,7 +152,7 @@ def test_empty_and_flat_sets_are_reported():
         ({"inputs": symmetric(1, 1)}, "inputs: has dimension 2"),
         ({"disturbance": Box([0.1, 0], [0.2, 1])}, "disturbance: does not hold the origin"),
         ({"disturbance": Box([-1, -INF], [0.2, 1])}, "disturbance: is unbounded"),
-        ({"max_iterations": 0}, "max_iterations: 0 is no positive"),
+        ({"max_iterations": 0}, "max_iterations: 0. Give a whole number"),
         ({"tolerance": 0.0}, "tolerance: 0.0 is not between"),
     ],
 )

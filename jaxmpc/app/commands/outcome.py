@@ -4,6 +4,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+# Files in which commands keep their results as JSON.
+RECORDS = ("summary.json", "tuning.json", "solver.json")
+
 
 @dataclass(frozen=True)
 class Outcome:

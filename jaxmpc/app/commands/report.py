@@ -7,12 +7,11 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from jaxmpc.app.commands.outcome import RECORDS
 from jaxmpc.app.options.report import ReportOptions
 from jaxmpc.checks import fail
 from jaxmpc.files import text_within
 
-# What the commands write their results to.
-RESULTS = ("summary.json", "tuning.json", "solver.json")
 STYLE = (
     "body{font:16px/1.5 system-ui,sans-serif;max-width:60rem;margin:2rem auto;padding:0 1rem}"
     "table{border-collapse:collapse;margin:.5rem 0}td,th{text-align:left;vertical-align:top;"
@@ -79,9 +78,9 @@ def folder_page(folder: Path) -> str:
 
     Raises ValueError where there are none, and where they are damaged.
     """
-    found = next((folder / name for name in RESULTS if (folder / name).exists()), None)
+    found = next((folder / name for name in RECORDS if (folder / name).exists()), None)
     if found is None:
-        raise ValueError(f"it holds none of {', '.join(RESULTS)}")
+        raise ValueError(f"it holds none of {', '.join(RECORDS)}")
     document = json.loads(text_within(found))
     if not isinstance(document, dict) or not isinstance(document.get("config", {}), dict):
         fail(str(folder), "holds other results than commands write", "Run the command again")
