@@ -247,14 +247,16 @@ class KalmanFilter:
 
     def _prepared_disturbances(self, p: int) -> tuple[Disturbance, ...]:
         """Return the disturbances with their matrices; raise ValueError where one is wrong."""
-        found, sizes = [], {"input": self.model.m, "output": p, "state": self.model.n}
+        found = []
         given = self._each
         if not all(isinstance(one, Disturbance) for one in given):
             what = f"is a {type(self.disturbance).__name__}"
             fail("observer.disturbance", what, "Give a closed_loop.Disturbance, or several")
         for i, one in enumerate(given):
             name = f"observer.disturbance[{i}]"
-            rows = sizes[one.kind] if one.kind in KINDS else self._entries(f"{name}.kind", one.kind)
+            if one.kind not in KINDS:
+                self._require_number(f"{name}.kind", one.kind)
+            rows = self._rows(one.kind)
             M = whole_array(np.eye(rows) if one.matrix is None else one.matrix)
             if M.ndim != 2 or M.shape[0] != rows or not M.shape[1]:
                 cure = f"Give ({rows}, k), a row for each entry of {one.kind}, or None"
@@ -279,9 +281,13 @@ class KalmanFilter:
             fail("observer.disturbance", what, "Give at most one for each measured output")
         return tuple(found)
 
-    def _entries(self, name: str, kind: str) -> int:
-        """Return how many entries a number of the robot's model has; raise ValueError where it has
-        no such number."""
+    def _rows(self, kind: str) -> int:
+        """Return how many numbers M d of a kind has."""
+        sizes = {"input": self.model.m, "output": self.p, "state": self.model.n}
+        return sizes[kind] if kind in KINDS else np.size(_number(_robot_model(self.model), kind))
+
+    def _require_number(self, name: str, kind: str) -> None:
+        """Raise ValueError unless the model is one of a robot that has this number."""
         model = _robot_model(self.model)
         if model is None:
             cure = f"Give one of {', '.join(KINDS)}; with a Robot as the model also its numbers"
@@ -293,9 +299,7 @@ class KalmanFilter:
             fail(name, f"{kind!r}", cure)
         if kind in OF_PLANTS and not physics.limited:
             fail(name, f"{kind!r}, of which the model has nothing", "Estimate another number")
-        value = _number(model, kind)
-        require_numbers(physics, {kind: value})
-        return np.size(value)
+        require_numbers(physics, {kind: _number(model, kind)})
 
     @property
     def estimates_numbers(self) -> bool:
@@ -312,9 +316,8 @@ class KalmanFilter:
         for kind in dict.fromkeys(one.kind for one in self._each if one.kind not in KINDS):
             M, own = (jnp.asarray(v, d.dtype) for v in (self.matrix(kind), _number(model, kind)))
             value = own + matmul(M, d).reshape(own.shape)
-            if (
-                kind in NONNEGATIVE
-            ):  # with the derivative of what d says, by which it leaves 0 again
+            if kind in NONNEGATIVE:
+                # With the derivative of what d says, by which it leaves 0 again.
                 value = value + jax.lax.stop_gradient(jnp.maximum(value, 0) - value)
             found[kind] = value
         return found
@@ -349,9 +352,7 @@ class KalmanFilter:
     def matrix(self, kind: str) -> Any:
         """Return M with M d added to inputs, outputs, states or a number (rows, k) of a prepared
         filter."""
-        rows = {"input": self.model.m, "output": self.p, "state": self.model.n}.get(kind)
-        if rows is None:
-            rows = next(len(one.matrix) for one in self._each if one.kind == kind)
+        rows = self._rows(kind)
         sizes = [(one, np.shape(one.matrix)[1]) for one in self._each]
         parts = [one.matrix if one.kind == kind else np.zeros((rows, k)) for one, k in sizes]
         return (np if concrete(parts) else jnp).concatenate([np.zeros((rows, 0)), *parts], axis=1)
@@ -534,7 +535,7 @@ def _robot_model(model: Any) -> RobotModel | None:
     return model if isinstance(model, RobotModel) else None
 
 
-def _number(model: RobotModel, kind: str) -> Any:
+def _number(model: Any, kind: str) -> Any:
     """Return a number of a model of a robot: its own, else that of the file."""
     file = 0.0 if kind == PAYLOAD else np.asarray(getattr(model.robot.predictor.mjx, kind))
     return model.numbers.get(kind, file)

@@ -394,7 +394,9 @@ class RobotController:
             reference, known["input_reference"] = self._held(reference, input_reference, numbers)
         if self.linearize == "trajectory":
             search = {"iterations": self.sqp_steps, "hessian": self.hessian, "scale": self.scale}
-            problem = NonlinearMPC(self.soft, as_model(self.robot, self.exact, numbers), self.tasks)
+            problem = self.problem
+            if numbers:
+                problem = replace(problem, model=replace(problem.model, numbers=dict(numbers)))
             return sqp_control(problem, self.solver, xi, before, reference, **known, **search)
         memory = None if before is None else before.memory
         last = last_input(self.soft, before, previous_input)
@@ -425,10 +427,8 @@ class RobotController:
         M = jnp.concatenate([(system.A - jnp.eye(n, dtype=r.dtype))[:, n - na :], system.B], axis=1)
         lost = file.step(r[:n], s) - told.step(r[:n], s)
         by = solve(ridged(matmul(M.T, M)), matmul(M.T, lost))
-        whole = jnp.zeros_like(r).at[n - na : n].set(by[:na])
-        return jnp.asarray(reference, self.dtype) + whole, (
-            jnp.asarray(input_reference, self.dtype) + by[na:]
-        )
+        states = jnp.asarray(reference, self.dtype).at[..., n - na : n].add(by[:na])
+        return states, jnp.asarray(input_reference, self.dtype) + by[na:]
 
     @property
     def problem(self) -> NonlinearMPC:
@@ -441,9 +441,9 @@ class RobotController:
         return reference_sizes(self.problem) if self.tasks else (self.mpc.system.n,)
 
 
-def as_model(robot: Any, exact: bool = True, numbers: Mapping[str, Any] | None = None) -> Any:
-    """Return a Robot, with these numbers, or LinearPlant as the model of a `NonlinearMPC`."""
-    return RobotModel(robot, dict(numbers or {}), exact) if isinstance(robot, Robot) else robot
+def as_model(robot: Any, exact: bool = True) -> Any:
+    """Return a Robot or LinearPlant as the model of a `NonlinearMPC`."""
+    return RobotModel(robot, exact=exact) if isinstance(robot, Robot) else robot
 
 
 # How much more than a violated limit of a state a violated limit of a force costs.

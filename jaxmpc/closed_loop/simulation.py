@@ -369,7 +369,7 @@ class Loop:
             state, disturbances = self.state(state), found if len(found) else None
         if getattr(self.controller, "observer", None) is not None:
             told["disturbance"] = disturbances
-        elif observer is not None and observer.estimates_numbers and disturbances is not None:
+        elif observer is not None and disturbances is not None and observer.estimates_numbers:
             if getattr(self.controller, "takes_numbers", False):
                 told["numbers"] = observer.numbers(disturbances)
         control = self.controller(seen, before, r, **told)

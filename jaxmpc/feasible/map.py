@@ -241,22 +241,32 @@ class FeasibleSetMap:
         `time.monotonic`, after which no round of rays begins. A set without interior, or unbounded,
         is returned as it is.
         """
+        found, left = self.refined(gap, rounds, deadline=deadline)
+        if left > gap:
+            warn_of_gap(left, gap)
+        return found
+
+    def refined(
+        self, gap: float, rounds: int = 30, *, deadline: float = np.inf
+    ) -> tuple["FeasibleSetMap", float]:
+        """Return the map of `refine`, and the gap that its rays leave, 0 for sets without one."""
         number("gap", gap, 0, "Give a gap of at least 0")
         if isinstance(self.problem, PolicyProblem):  # rays were sent for the labels
             points, _, normals, offsets, _ = policy_hull(self.problem).bounds
-            return replace(self, bound_point=points, bound_normal=normals, bound_offset=offsets)
+            found = replace(self, bound_point=points, bound_normal=normals, bound_offset=offsets)
+            return found, 0.0
         try:
             rays, proved, left = closed_bounds(self.problem, gap, rounds, deadline=deadline)
         except ValueError:
-            return self
+            return self, 0.0
         box = self.problem.programs.bounding_box[0]
-        if left > gap and box is not None and np.all(np.isfinite(box)):
-            warn_of_gap(left, gap)
+        bounded = box is not None and np.all(np.isfinite(box))
         points, _, normals, offsets, _ = proved
         labels = excluded(self.labels, rays.exact, self.x0s, normals, offsets)
-        return replace(
+        found = replace(
             self, labels=labels, bound_point=points, bound_normal=normals, bound_offset=offsets
         )
+        return found, left if bounded else 0.0
 
     def to_xarray(self) -> Any:
         """Return the map as an xarray.Dataset along the dimension `sample`, names and units

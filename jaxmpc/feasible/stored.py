@@ -13,7 +13,6 @@ centre last, and those of the cone by corner (cones, vertex).
 
 import re
 import sys
-import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -153,9 +152,8 @@ class StoredMap:
         """Return the map with the bounds that rays add, and write these into the store; see
         `FeasibleSetMap.refine`. Undecided points that they exclude count as infeasible."""
         none = np.zeros((0, self.problem.dimension))
-        with warnings.catch_warnings(record=True) as told:  # of the gap of these rays alone
-            warnings.filterwarnings("always", message="refine:")
-            alone = FeasibleSetMap.of(self.problem, none, Labels.empty(0, self.problem)).refine(gap)
+        empty = FeasibleSetMap.of(self.problem, none, Labels.empty(0, self.problem))
+        alone, left = empty.refined(gap)
         normals, offsets = alone.bound_normal, alone.bound_offset
         if self.undecided and len(offsets) and not isinstance(self.problem, PolicyProblem):
             exact = Rays.of(self.problem).exact
@@ -174,9 +172,7 @@ class StoredMap:
             np.concatenate([old.bound_normal, normals]),
             np.concatenate([old.bound_offset, offsets]),
         )
-        for other in (w for w in told if not str(w.message).startswith("refine:")):
-            warnings.warn_explicit(other.message, other.category, other.filename, other.lineno)
-        if any(str(w.message).startswith("refine:") for w in told):
+        if left > gap:
             low, high = joined.bounds.volume_bounds()
             if gap * high < high - low < np.inf:
                 warn_of_gap((high - low) / high, gap)

@@ -177,10 +177,7 @@ def tube_section(mpc: MPC) -> Zonotope:
     """Return the cross-section S of a tube. Raises ValueError where dynamics, gain or disturbances
     are traced, and as `minimal_robust_invariant_set`."""
     if not concrete(mpc.system, mpc.disturbance, mpc.disturbance_matrix, mpc.gain):
-        cure = (
-            "Give gain=K (None is the LQR of Q and R, traced as they are), else make a Controller "
-        )
-        cure += "outside of jit and grad and give it as an argument"
+        cure = "Give gain=K (None is the LQR of Q and R), or a Controller made outside of the trace"
         fail("policy", "'tube' beside traced dynamics, gain or disturbances", cure)
     gain, plant = np.asarray(feedback_gain(mpc), float), replace(mpc.system, c=None)
     A, B, _ = host_matrices(plant)

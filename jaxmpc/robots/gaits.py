@@ -100,14 +100,7 @@ def gait(
     feet = tuple(feet)
     standing_robot = robot.standing(feet, friction=friction)
     model = robot.mujoco
-    predictor: Any = standing_robot.predictor
-    normals = predictor.feet.frames[:, 0]
-    tilts = np.abs(normals - [0, 0, 1]).max(axis=1)
-    if tilts.max() > 1e-6:
-        what = f"stands on ground with the normal {np.round(normals[tilts.argmax()], 4).tolist()}"
-        fail(
-            "robot", what, "Turn the world of the file so that z is up: the trunk moves in x and y"
-        )
+    _require_level_ground(standing_robot)
     if not model.njnt or model.jnt_type[0] != FREE or not np.all(single_joints(model)[1:]):
         fail("robot", f"{robot.name} has other joints", "Give a free base, then hinges and slides")
     require_shape("velocity", velocity, (2,), "Along x and y, in m/s")
@@ -135,14 +128,7 @@ def gait(
 
     phases = (np.arange(count)[:, None] / count - starts) % 1.0
     standing = phases < duty - 1e-9
-    for foot, stands in zip(feet, standing.sum(axis=0), strict=True):
-        if stands < 1 or count - stands < _SWING:
-            what = f"{duty}: {foot} stands at {stands} of {count} control periods"
-            cure = (
-                f"Let it stand at 1 of them and swing at {_SWING} at least: another duty, a longer "
-            )
-            cure += "period or a shorter control_period"
-            fail("duty", what, cure)
+    _require_swings(feet, standing, duty)
     steps = np.append(velocity, 0.0) * count * robot.dt * duty
     away = steps * _along(phases, duty)[:, :, None] + [0, 0, lift] * _arc(phases, duty)[:, :, None]
     q = _joints(robot, x_rest[: model.nq], feet, places + away)
@@ -170,6 +156,28 @@ def gait(
         cones=Cones(C, D, np.where(faces, upper, np.inf)),
         names=feet,
     )
+
+
+def _require_level_ground(robot: Robot) -> None:
+    """Raise ValueError unless the feet stand on ground whose normal is z."""
+    predictor: Any = robot.predictor
+    normals = predictor.feet.frames[:, 0]
+    tilts = np.abs(normals - [0, 0, 1]).max(axis=1)
+    if tilts.max() > 1e-6:
+        what = f"stands on ground with the normal {np.round(normals[tilts.argmax()], 4).tolist()}"
+        cure = "Turn the world of the file so that z is up: the trunk moves in x and y"
+        fail("robot", what, cure)
+
+
+def _require_swings(feet: Sequence[str], standing: np.ndarray, duty: float) -> None:
+    """Raise ValueError unless each foot stands and swings for enough of the control periods (P, k)
+    of `standing`."""
+    count = len(standing)
+    for foot, stands in zip(feet, standing.sum(axis=0), strict=True):
+        if stands < 1 or count - stands < _SWING:
+            what = f"{duty}: {foot} stands at {stands} of {count} control periods"
+            by = "another duty, a longer period or a shorter control_period"
+            fail("duty", what, f"Let it stand at 1 of them and swing at {_SWING} at least: {by}")
 
 
 @compiled_lightly(0)

@@ -163,7 +163,7 @@ def with_forward_jacobian(function: Callable) -> Callable:
     wrapped = jax.custom_jvp(kept_unvarying(function))
 
     def rule(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-        def slopes(*primals: Any) -> Any:
+        def slopes(*primals: Any) -> Any:  # of all: what does not move may vary over a mesh
             of, at, _ = moving(lambda *args: (function(*args),) * 2, primals, tangents)
             return jax.jacfwd(of, argnums=tuple(range(len(at))), has_aux=True)(*at)
 

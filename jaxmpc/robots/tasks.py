@@ -160,9 +160,10 @@ def _between_segments(first: Segment, second: Segment) -> Array:
         # With (u·v)(v·w) − u·w = n·(v×w) and 1 − (u·v)² = n·n few digits cancel where they are
         # nearly parallel. Where they are parallel the middle serves; the clamps do the rest.
         n = jnp.cross(u, v)
-        sine, parallel = jnp.dot(n, n), jnp.finfo(n.dtype).eps ** 1.5
-        s = jnp.dot(n, jnp.cross(v, w)) / jnp.where(sine < parallel, 1.0, sine)
-        s = jnp.clip(jnp.where(sine < parallel, 0.0, s), -along_u, along_u)
+        squared_sine = jnp.dot(n, n)
+        parallel = squared_sine < jnp.finfo(n.dtype).eps ** 1.5
+        s = jnp.dot(n, jnp.cross(v, w)) / jnp.where(parallel, 1.0, squared_sine)
+        s = jnp.clip(jnp.where(parallel, 0.0, s), -along_u, along_u)
     if along_v:
         t = jnp.clip(jnp.dot(v, w + s * u), -along_v, along_v)
     if along_u:

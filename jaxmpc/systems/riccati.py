@@ -24,8 +24,8 @@ UNREACHED = 1e-10
 _DOUBLINGS = 40
 # Relative residual of the Riccati equation, or step of Newton's method, above which P is none.
 _RESIDUAL = 1e-6
-_TRACED_NEWTON = 3  # as traced
-_NEWTON = 20  # steps of Newton's method at most; from a stabilizing gain a few will do
+# Steps of Newton's method at most; from a stabilizing gain a few will do. Traced they are so many.
+_NEWTON, _TRACED_NEWTON = 20, 3
 
 
 @pytree
@@ -265,7 +265,7 @@ def _doubling(A: Array, B: Array, Q: Array, R: Array) -> Array:
 
     Step k holds the data (A_k, G_k, H_k) of 2^k steps of the Hamiltonian recursion at once, with
     G_0 = B R^-1 B' and H_0 = Q: H_k is the cost of 2^k steps with no cost at their end, A_k goes
-    to 0 and H_k to P, both quadratically.
+    to 0 and H_k to P, both quadratically. Steps of Newton's method make up for what R is given.
     """
 
     def double(carry: tuple[Array, ...]) -> tuple[Array, ...]:

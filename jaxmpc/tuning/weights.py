@@ -198,7 +198,9 @@ def _starting_points(
 ) -> list[Parameters]:
     """Return the parameters at each starting point, the given one first."""
     if isinstance(starts, Sequence) and not isinstance(starts, str):
+        points = [parameters]
         for i, given in enumerate(starts):
+            point = dict(parameters)
             for name in given if isinstance(given, Mapping) else [str(given)]:
                 if name not in parameters:
                     cure = f"{nearest(str(name), parameters)}Give values of {', '.join(parameters)}"
@@ -206,10 +208,11 @@ def _starting_points(
                 where, own = f"starts[{i}][{name!r}]", parameters[name]
                 require_shape(where, given[name], own.value.shape, "As the parameter's value")
                 try:
-                    replace(own, value=given[name])
+                    point[name] = replace(own, value=given[name])
                 except ValueError as error:
                     raise ValueError(str(error).replace("value", where, 1)) from None
-        return [parameters, *(moved(parameters, given) for given in starts)]
+            points.append(point)
+        return points
     random, theta = generator(seed), raw(parameters)
     draw = lambda: {name: v + random.normal(size=v.shape) for name, v in theta.items()}
     others = range(whole("starts", starts, 1) - 1)

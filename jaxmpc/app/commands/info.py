@@ -21,12 +21,13 @@ class Info(InfoOptions):
 
     def run(self) -> Outcome:
         """Print the report. Raises ValueError for options and files that make no sense."""
-        if self.html is not None and not self.html.parent.is_dir():
-            fail(f"--html {self.html}", "its folder does not exist", "Make it, or give another")
-        if self.html is not None and self.html.is_dir():
-            fail(f"--html {self.html}", "is a folder", "Name a file in it")
-        if self.html is not None and self.html.exists() and self.html.suffix != ".html":
-            fail(f"--html {self.html}", "exists and is no .html file", "Name another one")
+        if self.html is not None:
+            if not self.html.parent.is_dir():
+                fail(f"--html {self.html}", "its folder does not exist", "Make it, or give another")
+            if self.html.is_dir():
+                fail(f"--html {self.html}", "is a folder", "Name a file in it")
+            if self.html.exists() and self.html.suffix != ".html":
+                fail(f"--html {self.html}", "exists and is no .html file", "Name another one")
         config = configs.load(self.config, given_options(self, "horizon", "terminal"), "info")
         report = offline_report(
             config.build_controlled(),
