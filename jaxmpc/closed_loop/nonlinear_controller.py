@@ -1,5 +1,6 @@
 """NonlinearController: a nonlinear MPC problem as a feedback policy, by one or more QPs a step."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any, Literal
@@ -9,7 +10,7 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.arrays import Reals
-from jaxmpc.checks import require_kind
+from jaxmpc.checks import fail, require_kind
 from jaxmpc.closed_loop.feedback import Feedback, first_row, one_state
 from jaxmpc.mpc.controller import zeros_of
 from jaxmpc.mpc.plan import (
@@ -28,7 +29,9 @@ from jaxmpc.mpc.stagewise.nonlinear import NonlinearMPC, task_layout
 from jaxmpc.mpc.stagewise.sqp import checked_search, solve_nonlinear
 from jaxmpc.pytrees import prepared_pytree, static
 from jaxmpc.qp.admm import ADMM, DEFAULT
-from jaxmpc.qp.linalg import floating_dtype
+from jaxmpc.qp.linalg import floating_dtype, matmul, solve
+from jaxmpc.qp.newton import ridged
+from jaxmpc.robots.robot import RobotModel
 
 
 @prepared_pytree
@@ -94,6 +97,11 @@ class NonlinearController:
         return floating_dtype(replace(mpc, system=None))
 
     @property
+    def takes_numbers(self) -> bool:
+        """Return whether plans take numbers of the robot's model."""
+        return isinstance(self.model, RobotModel)
+
+    @property
     def state_size(self) -> int:
         """Return the length n of the state."""
         return self.mpc.system.n
@@ -126,17 +134,56 @@ class NonlinearController:
         *,
         input_reference: Reals | None = None,
         previous_input: Reals | None = None,
+        numbers: Mapping[str, Any] | None = None,
     ) -> Control[Plan]:
         """Return the input (m,) at the state x (n,), its plan, and what to remember.
 
         before: None, or what was returned at the time step before, of which also the input counts
         where its rate is limited or weighed and previous_input is None.
+        numbers: as in `RobotController`, of a `RobotModel`, in place of those that it has.
         """
         x = one_state(self, x)
         require_before(before)
+        problem = self.problem
+        if given_numbers(self, numbers, f"of a {type(self.model).__name__}", "a RobotModel"):
+            assert numbers is not None
+            model = replace(self.model, numbers={**self.model.numbers, **numbers})
+            problem = replace(problem, model=model)
+            reference, input_reference = held_references(
+                self.model, model, reference, input_reference, self.dtype
+            )
         search = {"iterations": self.sqp_steps, "hessian": self.hessian, "scale": self.scale}
         aims = {"input_reference": input_reference, "previous_input": previous_input}
-        return sqp_control(self.problem, self.solver, x, before, reference, **aims, **search)
+        return sqp_control(problem, self.solver, x, before, reference, **aims, **search)
+
+
+def given_numbers(controller: Any, numbers: Any, where: str, needed: str) -> bool:
+    """Return whether there are numbers of a robot's model; raise ValueError where plans take
+    none."""
+    if numbers is not None:
+        require_kind("numbers", numbers, Mapping, cure='Give {"payload": ...}')
+    if numbers and not controller.takes_numbers:
+        fail("numbers", f"given {where}", f"Give {needed}")
+    return bool(numbers)
+
+
+def held_references(
+    file: RobotModel, told: RobotModel, reference: Any, input_reference: Any, dtype: Any
+) -> tuple[Any, Any]:
+    """Return both references, activations and inputs changed by what makes up, at their first
+    rows, for the change of the next state from one model to the other: least squares, exact where
+    each joint has a motor. As they are where one of them is None."""
+    if reference is None or input_reference is None:
+        return reference, input_reference
+    r, s = (first_row(part, dtype) for part in (reference, input_reference))
+    n, na = file.robot.n, file.robot.mujoco.na
+    system: Any = told.linearize(r[:n], s)
+    # At rest activations α stay: (A − 1) α + B u makes up for what is lost.
+    M = jnp.concatenate([(system.A - jnp.eye(n, dtype=r.dtype))[:, n - na :], system.B], axis=1)
+    lost = file.step(r[:n], s) - told.step(r[:n], s)
+    by = solve(ridged(matmul(M.T, M)), matmul(M.T, lost))
+    states = jnp.asarray(reference, dtype).at[..., n - na : n].add(by[:na])
+    return states, jnp.asarray(input_reference, dtype) + by[na:]
 
 
 def sqp_control(

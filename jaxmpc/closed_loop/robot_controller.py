@@ -12,10 +12,12 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.arrays import Reals, as_weight, host_array
-from jaxmpc.checks import concrete, fail, number, require_kind, require_untraced, whole
-from jaxmpc.closed_loop.feedback import first_row, one_state
+from jaxmpc.checks import concrete, fail, number, require_untraced, whole
+from jaxmpc.closed_loop.feedback import one_state
 from jaxmpc.closed_loop.nonlinear_controller import (
     at_rest,
+    given_numbers,
+    held_references,
     last_input,
     reference_sizes,
     resting_start,
@@ -29,8 +31,7 @@ from jaxmpc.mpc.stagewise.nonlinear import NonlinearMPC, Task
 from jaxmpc.mpc.stagewise.solve import factor_stages, solve_stagewise
 from jaxmpc.pytrees import prepared_pytree, static
 from jaxmpc.qp.admm import ADMM, DEFAULT
-from jaxmpc.qp.linalg import arrays, floating_dtype, matmul, solve
-from jaxmpc.qp.newton import ridged
+from jaxmpc.qp.linalg import arrays, floating_dtype
 from jaxmpc.robots.contacts import friction_cones, stands
 from jaxmpc.robots.description import host_coordinates
 from jaxmpc.robots.equilibria import settled
@@ -380,23 +381,25 @@ class RobotController:
             "previous_input": previous_input,
         }
         xi = self.coordinates(x)
-        if numbers is not None:
-            require_kind("numbers", numbers, Mapping, cure='Give {"payload": ...}')
-        if numbers and not self.takes_numbers:
-            what = f"given with linearize={self.linearize!r} of a {type(self.robot).__name__}"
-            fail("numbers", what, 'Give linearize="state" or "trajectory" and a Robot')
+        where = f"with linearize={self.linearize!r} of a {type(self.robot).__name__}"
+        told = given_numbers(self, numbers, where, 'linearize="state" or "trajectory" and a Robot')
         if self.fixed is not None:
             return self.fixed(xi, before, reference, **known, forecast=forecast)
         if forecast is not None:
             what = f"given with linearize={self.linearize!r}"
             fail("forecast", what, 'Give linearize="set-point", or leave it out')
-        if numbers:
-            reference, known["input_reference"] = self._held(reference, input_reference, numbers)
+        if told:
+            file, loaded = (
+                RobotModel(self.robot, dict(part or {}), exact=False) for part in ({}, numbers)
+            )
+            reference, known["input_reference"] = held_references(
+                file, loaded, reference, input_reference, self.dtype
+            )
         if self.linearize == "trajectory":
             search = {"iterations": self.sqp_steps, "hessian": self.hessian, "scale": self.scale}
             problem = self.problem
-            if numbers:
-                problem = replace(problem, model=replace(problem.model, numbers=dict(numbers)))
+            if told:
+                problem = replace(problem, model=replace(loaded, exact=self.exact))
             return sqp_control(problem, self.solver, xi, before, reference, **known, **search)
         memory = None if before is None else before.memory
         last = last_input(self.soft, before, previous_input)
@@ -404,31 +407,12 @@ class RobotController:
         start = None if memory is None else memory.shifted(rows, memory.inputs[-1])
         inputs = at_rest(self.soft, xi, input_reference)[1] if memory is None else memory.inputs
         about = limited(self.soft.inputs, inputs[0])
-        with_numbers = {"numbers": numbers} if numbers else {}  # a LinearPlant takes none
+        with_numbers = {"numbers": numbers} if told else {}  # a LinearPlant takes none
         system = self.robot.linearize(x, about, exact=self.exact, **with_numbers)
         known |= {"previous_input": last, "scale": self.scale}
         mpc = replace(self.soft, system=system)
         plan = solve_stagewise(mpc, xi, reference, self.solver, start, **known)
         return applied(self.soft, rows, plan, memory, last)
-
-    def _held(
-        self, reference: Any, input_reference: Any, numbers: Mapping[str, Any]
-    ) -> tuple[Any, Any]:
-        """Return both references, activations and inputs changed by what makes up, at their first
-        rows, for the change of the next state by these numbers: least squares, exact where each
-        joint has a motor."""
-        if reference is None or input_reference is None:
-            return reference, input_reference
-        r, s = (first_row(part, self.dtype) for part in (reference, input_reference))
-        n, na = self.robot.n, self.robot.mujoco.na
-        file, told = (RobotModel(self.robot, dict(v), exact=False) for v in ({}, numbers))
-        system: Any = told.linearize(r[:n], s)
-        # At rest activations α stay: (A − 1) α + B u makes up for what is lost.
-        M = jnp.concatenate([(system.A - jnp.eye(n, dtype=r.dtype))[:, n - na :], system.B], axis=1)
-        lost = file.step(r[:n], s) - told.step(r[:n], s)
-        by = solve(ridged(matmul(M.T, M)), matmul(M.T, lost))
-        states = jnp.asarray(reference, self.dtype).at[..., n - na : n].add(by[:na])
-        return states, jnp.asarray(input_reference, self.dtype) + by[na:]
 
     @property
     def problem(self) -> NonlinearMPC:

@@ -11,6 +11,8 @@ from c_engine import c_steps
 import jaxmpc as jm
 from jaxmpc.closed_loop import Disturbance, KalmanFilter, LinearFeedback, Noise
 from jaxmpc.closed_loop.estimation import Belief, _drawn
+from jaxmpc.closed_loop.nonlinear_controller import held_references
+from jaxmpc.robots import RobotModel
 
 T, J = 0.1, 0.5
 SYSTEM = jm.LinearSystem(
@@ -400,8 +402,8 @@ def test_numbers_are_held_through_activations(loaded):
     for text in (slow, LOADED):
         robot = jm.load_robot(mujoco.MjModel.from_xml_string(text), control_period=0.02)
         x, u = robot.set_point([1.0])
-        controller = jm.RobotController(robot, jm.robot_mpc(robot, horizon=3, target=[1.0]))
-        r, s = controller._held(robot.coordinates(x), u, {"payload": jnp.asarray(0.7)})
+        file, told = (RobotModel(robot, numbers) for numbers in ({}, {"payload": 0.7}))
+        r, s = held_references(file, told, robot.coordinates(x), u, np.float64)
         at = np.asarray(robot.state(r))
         after = robot.vary(payload=0.7).step(at, s)
         np.testing.assert_allclose(after, at, atol=1e-6)
@@ -418,7 +420,7 @@ def test_numbers_are_held_through_activations(loaded):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("linearize", ["state", "trajectory"])
+@pytest.mark.parametrize("linearize", ["state", "trajectory", None])
 def test_plans_know_the_estimated_payload(loaded, linearize):
     """The rod hangs where its reference is, and is held there: with a load that nobody knows below
     it, with an estimated one where a controller that knows the load brings it."""
@@ -426,7 +428,11 @@ def test_plans_know_the_estimated_payload(loaded, linearize):
     mpc = jm.robot_mpc(loaded, horizon=5, target=target)
     x, torque = loaded.set_point(target)
     aims = {"reference": loaded.coordinates(x), "input_reference": torque}
-    controller = jm.RobotController(loaded, mpc, linearize=linearize)
+    if linearize is None:
+        problem = jm.mpc.NonlinearMPC(mpc, RobotModel(loaded, {"dof_damping": [0.2]}))
+        controller = jm.NonlinearController(problem, sqp_steps=3, hessian="gauss-newton")
+    else:
+        controller = jm.RobotController(loaded, mpc, linearize=linearize)
     known, plant = {"payload": 0.7}, loaded.vary(payload=0.7)
     load = Disturbance("payload", 1e-4, initial=0.5)
     errors = []
@@ -447,7 +453,7 @@ def test_plans_know_the_estimated_payload(loaded, linearize):
 @pytest.mark.long
 def test_the_covariance_of_numbers_is_that_of_the_linear_model(loaded):
     """By differences of the prediction, about numbers that are not the file's."""
-    model = jm.robots.RobotModel(loaded, numbers={"payload": 0.2})
+    model = RobotModel(loaded, numbers={"payload": 0.2})
     problem = jm.mpc.NonlinearMPC(jm.robot_mpc(loaded, horizon=2), model)
     load = Disturbance("payload", 0.01, [[2.0]], initial=0.3)
     observer = KalmanFilter(problem, 0.0, 1e-3, initial=0.1, disturbance=load).prepared()
@@ -460,7 +466,7 @@ def test_the_covariance_of_numbers_is_that_of_the_linear_model(loaded):
     )
     found = observer.predicted(Belief(mean, P), u).covariance
     np.testing.assert_allclose(found, F.T @ P @ F + np.diag([0, 0, 1e-4]), atol=1e-9)
-    heavier = jm.robots.RobotModel(loaded, numbers={"payload": 0.2 + 2 * 0.15})
+    heavier = RobotModel(loaded, numbers={"payload": 0.2 + 2 * 0.15})
     np.testing.assert_allclose(after(mean)[:2], heavier.step(mean[:2], u), atol=1e-12)
 
 

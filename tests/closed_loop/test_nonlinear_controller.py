@@ -290,6 +290,7 @@ def test_a_bad_reading_spoils_no_later_step(run):
         ("plant: has a step that returns shape", lambda p: loop(p, lambda x, u: x[:3])),
         ("forecast: given to a NonlinearController", lambda p: loop(p, car, forecast=np.zeros(4))),
         ("reference: shape", lambda p: jm.NonlinearController(p)(START, None, np.zeros(7))),
+        ("numbers: given of a", lambda p: jm.NonlinearController(p)(START, numbers={"m": 1.0})),
     ],
 )
 def test_wrong_arguments_are_named(argument, make):
