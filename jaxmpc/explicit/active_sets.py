@@ -23,12 +23,13 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
+from jaxmpc.arrays import Reals
 from jaxmpc.checks import fail
 from jaxmpc.explicit.parametric_program import (
     Output,
     ParametricQP,
     Quadratic,
-    cost_of_parameters,
+    cost_of_tracking,
     in_numpy,
 )
 from jaxmpc.mpc.condense import Inequalities, condensed_in_float64
@@ -275,8 +276,15 @@ class GivenProgram(NamedTuple):
     program: Program
 
     @classmethod
-    def of(cls, problem: MPC | ParametricQP, within: Box | Polytope | None) -> "GivenProgram":
-        """Return the program of a problem, all rows hard, on X_N or on X_N ∩ within."""
+    def of(
+        cls,
+        problem: MPC | ParametricQP,
+        within: Box | Polytope | None,
+        reference: Reals | None = None,
+        input_reference: Reals | None = None,
+    ) -> "GivenProgram":
+        """Return the program of a problem, all rows hard, on X_N or on X_N ∩ within; of an MPC
+        whose plans track these references."""
         p, (H, h) = problem.dimension, unit_half_spaces("within", within, problem.dimension)
         if isinstance(problem, ParametricQP):
             q = in_numpy(problem)
@@ -288,8 +296,8 @@ class GivenProgram(NamedTuple):
             if c.balls:
                 fail("terminal_set", "is an ellipsoid: its law is not affine", "Give a Polytope")
             C, D, b, row, side = Inequalities.of(c)
-            coefficients, P, F, f = (np.asarray(part) for part in (c.C, c.P, c.F, c.f))
-            alone = cost_of_parameters(problem, c)[2]
+            coefficients, P, F = (np.asarray(part) for part in (c.C, c.P, c.F))
+            f, alone = cost_of_tracking(problem, c, reference, input_reference)
             output = Output(*(np.asarray(part[0]) for part in (c.Omega, c.Psi, c.psi)))
             if problem.input_in_state and problem.inputs is not None:  # one that was applied
                 applied = at_stage(problem.inputs, 0)
@@ -425,13 +433,17 @@ class Window(NamedTuple):
 
 
 def least_distance_form(
-    problem: MPC | ParametricQP, within: Box | Polytope | None = None, reach: float = REACH
+    problem: MPC | ParametricQP,
+    within: Box | Polytope | None = None,
+    reach: float = REACH,
+    **references: Reals | None,
 ) -> LeastDistanceForm:
     """Return the least-distance form of a problem, all rows hard, on X_N or on X_N ∩ within.
 
     reach: size of the window, where this is unbounded, relative to the size of the rows' data.
+    references: `reference` and `input_reference` that the plans of an MPC track, as in `solve`.
     """
-    given = GivenProgram.of(problem, within)
+    given = GivenProgram.of(problem, within, **references)
     mpc = isinstance(problem, MPC)
     name = "mpc" if mpc else "problem"
     relax = RELAX if mpc else "Relax a limit or enlarge within"

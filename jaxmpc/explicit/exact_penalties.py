@@ -95,6 +95,8 @@ def exact_penalty(
     mpc: MPC,
     x0s: Reals | None = None,
     *,
+    reference: Reals | None = None,
+    input_reference: Reals | None = None,
     method: str = "auto",
     rho: float | None = None,
     max_regions: int = 2000,
@@ -114,6 +116,8 @@ def exact_penalty(
     Rows that no input moves (k = 0) are constants and do not count; inputs and rates stay hard.
 
     x0s (B, p) or None: states at which to give the threshold as well; p = mpc.dimension.
+    reference, input_reference: what the plans track, as in `solve`, None for zero: rho_bar is that
+    of these, and may be far larger than that of the origin.
     method: "regions", "samples" or "auto"; see below.
     rho: a weight to check; None: those of `mpc.soft`, if any.
     max_regions: critical regions to enumerate at most.
@@ -148,7 +152,8 @@ def exact_penalty(
     if x0s.ndim != 2 or x0s.shape[1] != mpc.dimension:
         fail("x0s", f"shape {x0s.shape}", f"Give states (B, {mpc.dimension})")
 
-    p, table = least_distance_form(mpc, within), row_table(mpc)
+    p = least_distance_form(mpc, within, reference=reference, input_reference=input_reference)
+    table = row_table(mpc)
     if p.given.parameters.tied:
         what = "its feasible set is flat, as equalities tie the states to each other"
         fail("mpc", what, "Relax one of them")

@@ -15,6 +15,7 @@ from jaxmpc.checks import (
     require_symmetric_psd,
 )
 from jaxmpc.mpc.condense import Condensed, Inequalities, condensed_in_float64
+from jaxmpc.mpc.plan import checked_array, reference_shapes
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import record
 
@@ -219,11 +220,31 @@ def parametric_qp(
     )
 
 
+def cost_of_tracking(
+    mpc: MPC, c: Condensed, reference: Reals | None, input_reference: Reals | None
+) -> tuple[np.ndarray, Quadratic]:
+    """Return f (nz,) of the cost ½ z'Pz + (F θ + f)'z of plans that track references, as in
+    `solve`, None for zero, and what the cost has in θ alone."""
+    given = {"reference": reference, "input_reference": input_reference}
+    if all(value is None for value in given.values()):
+        return np.asarray(c.f), cost_of_parameters(mpc, c)[2]
+    columns, shapes = [], reference_shapes(mpc)
+    for name, value in given.items():
+        shape = shapes[name]
+        checked = checked_array(name, np.zeros(shape[0]) if value is None else value, shape)
+        require_finite(name, checked)
+        columns.append(host_array(name, checked)[..., None])
+    F, alone = cost_of_parameters(mpc, c, *columns)[1:]
+    p = mpc.dimension  # the parameter behind θ is 1
+    return np.asarray(c.f) + F[:, p], alone.along(np.eye(p + 1)[p], np.eye(p + 1)[:, :p])
+
+
 def cost_of_parameters(
     mpc: MPC, c: Condensed, of_states: np.ndarray | None = None, of_inputs: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray, Quadratic]:
     """Return q, F and what the cost of a plan has in (θ, r) alone; of_states (n, k), of_inputs
-    (m, k): the references that r stands for, None: no r.
+    (m, k): the references that r stands for, (N+1, n, k) and (N, m, k) if they differ from step to
+    step; None: no r.
 
     The cost is Σ e_k'W_k e_k over states, inputs and rates, each e_k affine in (z, θ, r): with
     e_k = E_k z + T_k (θ, r) + t_k these are 2 Σ E_k'W_k T_k and so on.
@@ -231,7 +252,7 @@ def cost_of_parameters(
     N, n, m, p = mpc.horizon, mpc.system.n, mpc.system.m, mpc.dimension
     of_states = np.zeros((n, 0)) if of_states is None else of_states
     of_inputs = np.zeros((m, 0)) if of_inputs is None else of_inputs
-    k = of_states.shape[1]
+    k = of_states.shape[-1]
 
     def track(M: np.ndarray, target: np.ndarray) -> np.ndarray:
         return np.concatenate([M, np.broadcast_to(-target, (*M.shape[:2], k))], axis=2)

@@ -4,6 +4,7 @@ import time
 from collections import deque
 from dataclasses import replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -232,6 +233,8 @@ def critical_regions(
     problem: MPC | ParametricQP,
     within: Box | Polytope | None = None,
     *,
+    reference: Reals | None = None,
+    input_reference: Reals | None = None,
     max_regions: int = 5000,
     seconds: float = np.inf,
 ) -> CriticalRegions:
@@ -242,7 +245,8 @@ def critical_regions(
     `parametric_qp` makes references parameters. within: the set of parameters that matter, None
     for all. Equalities that rows imply, as two opposite ones do, are taken out first; where they
     tie parameters to each other, regions are those of the parameters that are left free. The set
-    may be unbounded.
+    may be unbounded. reference, input_reference: what the plans of an MPC track, as in `solve`;
+    None for zero.
 
     max_regions: the most regions to look for. seconds: after which the search stops (some linear
     programs and the hull of all vertices are finished; in five and six dimensions that may take
@@ -264,11 +268,16 @@ def critical_regions(
     deadline = time.monotonic() + seconds
     require_kind("problem", problem, MPC, ParametricQP)
     problem.validate()
+    references: dict[str, Any] = {"reference": reference, "input_reference": input_reference}
+    for name, value in references.items():
+        if value is not None and isinstance(problem, ParametricQP):
+            fail(name, "given with a ParametricQP", "Give the MPC problem, or let q hold it")
     if isinstance(problem, MPC) and problem.soft:
         fail("mpc.soft", "has rows, and slacks make another QP", "Make the rows hard first")
     reach = REACH
     for _ in range(WINDOWS):
-        search = explore(least_distance_form(problem, within, reach), max_regions, deadline)
+        form = least_distance_form(problem, within, reach, **references)
+        search = explore(form, max_regions, deadline)
         seen = search.seen
         if seen <= 1 / ROOM or search.full:
             break

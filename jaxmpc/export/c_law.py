@@ -106,7 +106,8 @@ def export_explicit_c(
     tolerance: float | None = None,
     overwrite: bool = False,
 ) -> list[Path]:
-    """Write the explicit law of `jm.explicit.critical_regions` as C99 code, for references of zero.
+    """Write the explicit law of `jm.explicit.critical_regions` as C99 code, for the references that
+    this was given.
 
     Nothing is allocated, and nothing is solved: a call takes as many products of p numbers as the
     tree is deep, and those of one region's facets. What it costs is memory, which grows as the

@@ -137,8 +137,10 @@ class SetPoint:
             text.append(f"breaks the {name}")
         if not np.any(self.drift) and not self.broken:
             text.append("an equilibrium that keeps all limits")
-        text.append("closed loops go there; of the optimal law (its claim, its penalty), and of")
-        text.append("stability, the report speaks as of the law whose set-point is the origin")
+        text.append(
+            "closed loops go there, and the penalty is of the law with this set-point; of its"
+        )
+        text.append("claim and of stability the report speaks as of the law about the origin")
         return "\n".join(text)
 
 
@@ -147,8 +149,8 @@ class OfflineReport:
     """Everything that is known of an MPC problem before it runs; `print` shows it.
 
     feasible_set: map of initial states with proofs, of the problem with its soft rows hard; volume:
-    lower and upper bound of its volume. recursion, penalty, terminal: the reports of
-    `recursive_feasibility`, `exact_penalty` and `verify_terminal`, of the law whose set-point is
+    lower and upper bound of its volume. penalty: the report of `exact_penalty`. recursion,
+    terminal: those of `recursive_feasibility` and `verify_terminal`, of the law whose set-point is
     the origin. loops: closed loops to the set-point that were simulated, not proved. None, where
     they do not apply or the time was over. set_point: where the loops go, and what moves away from
     there.
@@ -236,7 +238,7 @@ def offline_report(
             those of `recursive_feasibility` for its test.
         reference, input_reference: the set-point of closed loops, (n,) and (m,); None for zero. It
             is shown, with whether it is an equilibrium inside the limits. It moves the optimal
-            law: what is said of that beyond the closed loops is said of the origin as set-point.
+            law: its claim and its stability are those of the origin as set-point.
         steps: length of the closed loops. loops: how many of them.
         K: terminal law to verify, (m, n); None: that of the LQR.
         seconds: time limit of the whole call. Linear programs take seconds, thousands of facets or
@@ -276,7 +278,8 @@ def offline_report(
     recursion = _or_note(notes, "recursion", examined)
     budget.say("exact penalty, by critical regions")
     left = proofs.deadline - time.monotonic()
-    penalty = _or_note(notes, "penalty", partial(exact_penalty, mpc, seconds=left))
+    aimed = partial(exact_penalty, mpc, reference=set_point.x, input_reference=set_point.u)
+    penalty = _or_note(notes, "penalty", partial(aimed, seconds=left))
     fmap = mapped(problem, x0s, budget)
     inside = np.zeros((0, problem.dimension)) if fmap is None else fmap.x0s[fmap.label == 1]
     followed = None

@@ -42,6 +42,24 @@ def test_steps_of_a_law_that_takes_none(tmp_path, capsys):
     assert "--iterations: 9 where --law explicit has regions" in capsys.readouterr().err
 
 
+@pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
+def test_the_reference_of_the_file_is_in_the_law(tmp_path, capsys):
+    """At its equilibrium nothing moves, and from the origin it is approached."""
+    path, folder = tmp_path / "p.toml", tmp_path / "code"
+    path.write_text(FILE.replace("[limits]", "[reference]\nstate = [0.5, 0.0]\n[limits]"))
+    words = ["export", "--config", str(path), "--law", "explicit", "--output", str(folder)]
+    assert not cli.main(words)
+    said = capsys.readouterr().out
+    assert "that of the file: the function takes none" in said
+    subprocess.run(said.strip().splitlines()[-1].removeprefix("Next: "), shell=True, check=True)
+    states = "0.5 0\n0 0\n1 0\n"
+    answers = subprocess.run(
+        [folder / "example"], input=states, capture_output=True, text=True, check=True
+    ).stdout.splitlines()
+    there, before, beyond = (float(line.split()[0]) for line in answers[:3])
+    assert abs(there) < 1e-9 and before > 0.1 and abs(before + beyond) < 1e-9
+
+
 FILE = """name = "p"
 [system]
 A = [[1.0, 0.1], [0.0, 1.0]]
@@ -63,14 +81,13 @@ horizon = 4
 @pytest.mark.parametrize(
     "old, new, message",
     [
-        ("[limits]", "[reference]\nstate = [0.5, 0.0]\n[limits]", "reference: is given, .*--law s"),
         ("[-2.0, -1.0]", '["-Infinity", -1.0]', "limits.x_min, x_max: leave .* Bound every state"),
         ("R = [0.1]", "R = [0.1]\nrho = 100.0", "cost.rho: has rows"),
         ("horizon = 4", 'horizon = 4\nterminal = "ellipsoid"', "mpc.terminal: is an ellipsoid"),
     ],
 )
 def test_what_has_no_regions_names_the_key(old, new, message, tmp_path, capsys):
-    """The regions are those of one law, about the origin, of a bounded set."""
+    """The regions are those of one law of a bounded set."""
     path = tmp_path / "p.toml"
     path.write_text(FILE.replace(old, new))
     words = ["export", "--law", "explicit", "--config", str(path), "--output", str(tmp_path / "e")]

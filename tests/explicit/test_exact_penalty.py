@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import jax
 import numpy as np
 import osqp
 import problems
@@ -210,6 +211,25 @@ class TestExactPenalty:
         found = exact_penalty(problems.lecture(), max_regions=3, samples=20)
         assert not found.exact and found.method == "samples" and found.regions is not None
         assert found.rho_bar == pytest.approx(11.25, rel=1e-9)
+
+    def test_of_what_is_tracked(self):
+        """A target beyond a limit presses plans against it: the threshold of the origin is too
+        small there, and slacks appear at states from which the limit can be kept."""
+        system = jm.LinearSystem([[1.0, 1], [0, 1]], [[0.5], [1]])
+        box = jm.Box([-5, -5], [5, 5])
+        mpc = jm.MPC(system, [1.0, 1], 1.0, 3, box, jm.Box(-1, 1))
+        r = np.array([20.0, 0])
+        origin, there = exact_penalty(mpc), exact_penalty(mpc, reference=r)
+        assert there.exact and there.rho_bar > 10 * max(origin.rho_bar, 1)
+        x0s = np.random.default_rng(0).uniform(-5, 5, (40, 2))
+        plan = lambda mpc: jax.vmap(lambda x: jm.solve(mpc, x, r))(x0s)
+        with jax.enable_x64(True):
+            hard = plan(mpc)
+            apart = [
+                np.abs(hard.inputs - plan(jm.soften(mpc, found.advised)).inputs)[hard.solved].max()
+                for found in (there, origin)
+            ]
+        assert apart[0] < 1e-8 and apart[1] > 0.1
 
     def test_errors(self):
         mpc = problems.lecture()

@@ -148,8 +148,8 @@ def test_a_row_that_is_dropped_is_noticed(monkeypatch):
 
     form = active_sets.least_distance_form
 
-    def lossy(mpc, within, reach):
-        p = form(mpc, within, reach)
+    def lossy(mpc, within, reach, **references):
+        p = form(mpc, within, reach, **references)
         # the limits of x1 at the end of the horizon
         lost = np.abs(p.given.C[p.hull.rows]).sum(axis=1) == np.abs(p.given.C).sum(axis=1).max()
         lost &= p.side > 0

@@ -206,6 +206,28 @@ class TestOfAnMPC:
             lambda t: np.full((3, 1), 0.1 * t[3]),
         )  # fmt: skip
 
+    def test_given_references(self):
+        """Also such that differ from step to step, and beside a rate's weight."""
+        random = np.random.default_rng(0)
+        mpc = jm.MPC(INTEGRATOR, [1.0, 1], 0.1, 3, X, U, terminal_set=X)
+        rates = replace(mpc, input_rate_weight=[0.3])
+        for given, r, s in (
+            (mpc, np.array([4.5, 0.2]), None),
+            (mpc, None, np.array([0.3])),
+            (rates, random.uniform(-3, 3, (4, 2)), random.uniform(-1, 1, (3, 1))),
+        ):
+            regions = critical_regions(given, reference=r, input_reference=s)
+            thetas = random.uniform(-1, 1, (6, given.dimension)) * [4, 2, 1][: given.dimension]
+            aims = [
+                None if v is None else lambda _, v=v, k=k: np.broadcast_to(v, (k, v.shape[-1]))
+                for v, k in ((r, 4), (s, 3))
+            ]
+            self.agrees(given, regions, thetas, *aims)
+        with pytest.raises(ValueError, match="reference: shape"):
+            critical_regions(mpc, reference=[1.0, 2, 3])
+        with pytest.raises(ValueError, match="input_reference: given with a ParametricQP"):
+            critical_regions(parametric_qp(mpc), input_reference=[1.0])
+
     def test_without_limits_it_is_lqr(self):
         """One region, R²: with the Riccati cost at the end the law is the gain of LQR."""
         found = jm.lqr(INTEGRATOR, np.eye(2), 0.1)

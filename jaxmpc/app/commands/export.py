@@ -28,12 +28,8 @@ from jaxmpc.qp.admm import ADMM
 def _regions(config: configs.Config, mpc: MPC) -> CriticalRegions:
     """Return the critical regions of a file's problem. Raises ValueError, naming its keys, where
     there are none to export."""
-    if any(np.any(given) for given in config.references().values()):
-        what = "is given, and regions are those of the law whose set-point is the origin"
-        cure = "Take --law steps, whose C function takes references, or leave the section out"
-        raise config.origin.error(f"reference: {what}. {cure}")
     try:
-        regions = critical_regions(mpc)
+        regions = critical_regions(mpc, **config.references())
     except ValueError as error:
         raise config.origin.error(config.renamed(str(error))) from None
     if regions.window is not None:
@@ -109,8 +105,10 @@ class Export(ExportOptions):
                 overwrite=self.overwrite,
             )
             summary |= {"iterations": solver.iterations, "tolerance": tolerance}
-        if config.references() and self.law != "explicit":
+        if config.references():
             said = "an argument of the function: what the file says is not in the code"
+            if self.law == "explicit":
+                said = "that of the file: the function takes none"
             rows.append(("reference", said))
         print(f"{config.name}\n")
         kind = "" if self.law == "jax" else " of text"

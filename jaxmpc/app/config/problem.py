@@ -434,7 +434,9 @@ class Config:
 
     @_in_keys
     def _softened(self, mpc: MPC, rho: Any) -> MPC:
-        return soften(mpc, exact_penalty(mpc).advised if isinstance(rho, str) else rho)
+        if isinstance(rho, str):
+            rho = exact_penalty(mpc, **self.references()).advised
+        return soften(mpc, rho)
 
     def build_solver(self) -> ADMM | None:
         """Return the solver of [solver]; None without that section."""
