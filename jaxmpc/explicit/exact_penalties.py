@@ -1,7 +1,7 @@
 """Exact penalties: from which weight on slacks the soft problem keeps limits that can be kept."""
 
 import time
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -152,8 +152,8 @@ def exact_penalty(
     if x0s.ndim != 2 or x0s.shape[1] != mpc.dimension:
         fail("x0s", f"shape {x0s.shape}", f"Give states (B, {mpc.dimension})")
 
-    p = least_distance_form(mpc, within, reference=reference, input_reference=input_reference)
-    table = row_table(mpc)
+    references: dict[str, Any] = {"reference": reference, "input_reference": input_reference}
+    p, table = least_distance_form(mpc, within, **references), row_table(mpc)
     if p.given.parameters.tied:
         what = "its feasible set is flat, as equalities tie the states to each other"
         fail("mpc", what, "Relax one of them")
@@ -165,7 +165,7 @@ def exact_penalty(
     regions: CriticalRegions | None = None
     if method == "regions" or (method == "auto" and len(p.center) <= ENUMERATED):
         explored = explore(p, max_regions, deadline)
-        regions = CriticalRegions.of(mpc, explored)
+        regions = CriticalRegions.of(mpc, explored, **references)
         for c in explored.found:
             search.found[c.law.active] = weigh.over(c.law, c.vertices)
     exact = regions is not None and regions.complete

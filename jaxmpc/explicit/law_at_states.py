@@ -5,14 +5,18 @@ active rows of the plan there, by the optimality conditions, and holds on a poly
 region.
 """
 
-from typing import NamedTuple
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
 
+from jaxmpc.arrays import Reals
+from jaxmpc.explicit.parametric_program import cost_of_tracking
 from jaxmpc.explicit.regions import CriticalRegions
 from jaxmpc.mpc.condense import Inequalities, condensed_in_float64
 from jaxmpc.mpc.many import solve_many
+from jaxmpc.mpc.plan import References
 from jaxmpc.mpc.problem import MPC, at_stage
 from jaxmpc.pytrees import record
 from jaxmpc.qp.admm import ADMM
@@ -44,13 +48,17 @@ class Law:
     """u_0(x), the first input of the optimal plan, in batches of `chunk` states.
 
     easy (p,): a state well inside the feasible set, which fills batches up. States may lack the
-    previous input where it only has a weight: it is zero then.
+    previous input where it only has a weight: it is zero then. references: `reference` and
+    `input_reference` that plans track, as in `solve`.
     """
 
-    def __init__(self, mpc: MPC, easy: np.ndarray, chunk: int) -> None:
+    def __init__(self, mpc: MPC, easy: np.ndarray, chunk: int, **references: Reals | None) -> None:
         self.mpc, self.easy, self.chunk = mpc, easy, chunk
+        self.references: References = references
         self.A, self.B, self.c = host_matrices(mpc.system)
-        self.condensed = c = condensed_in_float64(mpc)
+        c = condensed_in_float64(mpc)
+        f: Any = cost_of_tracking(mpc, c, **references)[0]
+        self.condensed = c = replace(c, f=f)
         rows, size = Inequalities.of(c).normalised()
         self.C, self.D, self.b = rows.C, rows.D, rows.b
         row = rows.row
@@ -65,7 +73,9 @@ class Law:
 
     def plans(self, states: np.ndarray) -> "LawPlans":
         """Return the plans from states (B, p), in programs of one shape."""
-        found = solve_many(self.mpc, self.filled(states), ADMM(eps=EPS), chunk=self.chunk)
+        found = solve_many(
+            self.mpc, self.filled(states), ADMM(eps=EPS), chunk=self.chunk, **self.references
+        )
         first = [np.asarray(getattr(found, name))[: len(states)] for name in LawPlans._fields]
         return LawPlans(*first)
 
@@ -185,7 +195,7 @@ class RegionLaw(Law):
     none of them has no plan."""
 
     def __init__(self, regions: CriticalRegions, easy: np.ndarray, chunk: int) -> None:
-        super().__init__(regions.mpc, easy, chunk)
+        super().__init__(regions.mpc, easy, chunk, **regions.references)
         self.regions = regions
 
     def plans(self, states: np.ndarray) -> LawPlans:

@@ -221,7 +221,10 @@ def parametric_qp(
 
 
 def cost_of_tracking(
-    mpc: MPC, c: Condensed, reference: Reals | None, input_reference: Reals | None
+    mpc: MPC,
+    c: Condensed,
+    reference: Reals | None = None,
+    input_reference: Reals | None = None,
 ) -> tuple[np.ndarray, Quadratic]:
     """Return f (nz,) of the cost ½ z'Pz + (F θ + f)'z of plans that track references, as in
     `solve`, None for zero, and what the cost has in θ alone."""

@@ -94,6 +94,7 @@ class CriticalRegions:
     reach beyond it, they do as their rows say.
     free (d,): the indices of the free parameters; where equalities tie the others to these, volumes
     are in these. volume: the sum. reason: what was checked, or what stopped the search.
+    references: `reference` and `input_reference`, where plans of an MPC track these.
     """
 
     problem: MPC | ParametricQP
@@ -104,9 +105,12 @@ class CriticalRegions:
     seconds: float
     free: tuple[int, ...]
     window: np.ndarray | None
+    references: dict[str, Any]
 
     @classmethod
-    def of(cls, problem: MPC | ParametricQP, search: "RegionSearch") -> "CriticalRegions":
+    def of(
+        cls, problem: MPC | ParametricQP, search: "RegionSearch", **references: Any
+    ) -> "CriticalRegions":
         """Return what a search has found, in the coordinates of θ, and whether it fills X_N."""
         complete, reason = search.fill()
         p = search.p
@@ -125,7 +129,8 @@ class CriticalRegions:
             complete = complete and search.seen <= 1 / ROOM
             reason += f"; its vertices lie in {search.seen:.1e} of a window onto the unbounded set"
         free = tuple(p.given.parameters.free.tolist())
-        return cls(problem, regions, complete, total, reason, seconds, free, window)
+        given = {name: value for name, value in references.items() if value is not None}
+        return cls(problem, regions, complete, total, reason, seconds, free, window, given)
 
     @property
     def mpc(self) -> MPC:
@@ -282,7 +287,7 @@ def critical_regions(
         if seen <= 1 / ROOM or search.full:
             break
         reach *= max(4.0, 2 * ROOM * seen)
-    return CriticalRegions.of(problem, search)
+    return CriticalRegions.of(problem, search, **references)
 
 
 # --- The search, across facets ----------------------------------------------------------

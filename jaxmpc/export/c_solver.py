@@ -26,7 +26,7 @@ from jaxmpc.checks import (
 )
 from jaxmpc.export.c_files import GIVE_PROBLEM, CFiles, input_limits, literal
 from jaxmpc.mpc.controller import Controller
-from jaxmpc.mpc.plan import Plan, WarmStart
+from jaxmpc.mpc.plan import Plan, References, WarmStart, constant_references
 from jaxmpc.mpc.policy_rows import PolicyCondensed
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.admm import ADMM
@@ -241,29 +241,11 @@ class ClosedLoopCheck:
     input_error_any: float
 
 
-# State and input to track, as `Controller` takes them.
-Target = tuple[Any, Any]
-
-
 def require_box(mpc: MPC, lower: Any, upper: Any) -> None:
     """Raise ValueError where the corners of a box of states are not (n,) finite numbers each."""
     for argument, bound in (("lower", lower), ("upper", upper)):
         require_shape(argument, bound, (mpc.system.n,), "Give a number for each state")
         require_finite(argument, bound)
-
-
-def target_of(mpc: MPC, reference: Reals | None, input_reference: Reals | None) -> Target:
-    """Return the target of closed loops; ValueError for references of other shapes."""
-
-    def checked(argument: str, value: Reals | None, size: int) -> np.ndarray | None:
-        if value is None:
-            return None
-        require_shape(argument, value, (size,), "Give one number each: where the loops stay")
-        require_finite(argument, value)
-        return host_array(argument, value)
-
-    n, m = mpc.system.n, mpc.system.m
-    return checked("reference", reference, n), checked("input_reference", input_reference, m)
 
 
 def solved_by_code(controller: Controller, plan: Plan, tolerance: Any) -> Any:
@@ -278,16 +260,15 @@ def solved_by_code(controller: Controller, plan: Plan, tolerance: Any) -> Any:
 
 
 @jax.jit  # compiled once for all controllers of a problem
-def _controls(controller: Controller, states: Any, before: Any, target: Target) -> Any:
+def _controls(controller: Controller, states: Any, before: Any, target: References) -> Any:
     """Return inputs (B, m) and statuses (B,) of plans from states (B, n) after inputs (B, m)."""
-    x_aim, u_aim = target
-    one = lambda x, u: controller(x, None, x_aim, input_reference=u_aim, previous_input=u)
+    one = lambda x, u: controller(x, None, **target, previous_input=u)
     found = jax.vmap(one)(states, before)
     return found.u, found.plan.status
 
 
 def _precise_plans(
-    controller: Controller, states: np.ndarray, before: np.ndarray, target: Target
+    controller: Controller, states: np.ndarray, before: np.ndarray, target: References
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return `_controls` in parts of one shape."""
     program = lambda rows: _controls(controller, *rows, target)
@@ -295,7 +276,7 @@ def _precise_plans(
 
 
 def starting_states(
-    controller: Controller, lower: np.ndarray, upper: np.ndarray, seed: int, target: Target
+    controller: Controller, lower: np.ndarray, upper: np.ndarray, seed: int, target: References
 ) -> np.ndarray:
     """Return random states (`LOOPS`, n) of a box, such that have a plan where there are some."""
     starts = np.random.default_rng(seed).uniform(lower, upper, (DRAWN, len(lower)))
@@ -339,12 +320,12 @@ def check_fixed_steps(
         lower, upper = host_array("lower", lower), host_array("upper", upper)
         fixed = Controller(mpc, replace(solver, newton_steps=0, eps=tolerance))
         precise = Controller(mpc, ADMM())
-        target = target_of(mpc, reference, input_reference)
+        target = constant_references(mpc, reference, input_reference)
         starts = starting_states(precise, lower, upper, seed, target)
 
         def step(state: Any, _: Any) -> Any:
             x, before = state
-            control = fixed(x, before, target[0], input_reference=target[1])
+            control = fixed(x, before, **target)
             solved = solved_by_code(fixed, control.plan, tolerance)
             return (mpc.system.step(x, control.u), control), (x, before.u, control.u, solved)
 

@@ -19,14 +19,13 @@ from jaxmpc.checks import number, require_kind, require_untraced, whole
 from jaxmpc.export.c_files import GIVE_PROBLEM
 from jaxmpc.export.c_solver import (
     LOOPS,
-    Target,
     check_fixed_steps,
     require_box,
     solved_by_code,
     starting_states,
-    target_of,
 )
 from jaxmpc.mpc.controller import Controller
+from jaxmpc.mpc.plan import References, constant_references
 from jaxmpc.mpc.policy_rows import PolicyCondensed
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.admm import ADMM
@@ -82,7 +81,7 @@ def choose_steps(
     with jax.enable_x64(True):
         precise = Controller(mpc, ADMM())
         corners = host_array("lower", lower), host_array("upper", upper)
-        target = target_of(mpc, reference, input_reference)
+        target = constant_references(mpc, reference, input_reference)
         starts = starting_states(precise, *corners, seed, target)
         layout = precise.condensed.layout
         kinds = np.repeat(np.arange(len(layout)), [len(ks) * size for _, ks, size in layout])
@@ -102,8 +101,7 @@ def choose_steps(
             if iterations is not None or reached >= share:
                 return solver
             # Not every plan need have a solution: then precise plans say how many have.
-            aim = {"reference": reference, "input_reference": input_reference}
-            found = check_fixed_steps(mpc, solver, lower, upper, plans, tolerance, seed, **aim)
+            found = check_fixed_steps(mpc, solver, lower, upper, plans, tolerance, seed, **target)
             say(f"and {found.reached:,} of the {found.solvable:,} that have a solution")
             if found.reached >= share * found.solvable:
                 return solver
@@ -118,7 +116,7 @@ def choose_steps(
 def _improved(
     make: Callable[[Any], Controller],
     starts: Any,
-    target: Target,
+    target: References,
     length: int,
     rho: np.ndarray,
     kinds: np.ndarray,
@@ -136,7 +134,7 @@ def _improved(
 
         def step(state: Any, _: Any) -> Any:
             x, before = state
-            control = controller(x, before, target[0], input_reference=target[1])
+            control = controller(x, before, **target)
             solved = solved_by_code(controller, control.plan, controller.solver.eps)
             return (system.step(x, control.u), control), solved
 

@@ -349,23 +349,17 @@ def plan_with(
     """Return the plan of an aim, and the solution of its QP by `solve`, which takes what
     `solve_factored` does. share: of the tolerances, that the plan must keep."""
     c, mpc = controller.condensed, controller.mpc
-    N, n, m = mpc.horizon, mpc.system.n, mpc.system.m
     aim = aim if mpc.input_in_state else aim._replace(previous_input=None)
     aim = jax.tree.map(lambda v: jnp.asarray(v, c.P.dtype), aim)
     finite = all_finite(aim)
     # Harmless numbers until all is computed: the derivative of a product with NaN is NaN.
     aim = jax.tree.map(lambda v: jnp.where(finite, v, 0.0), aim)
-    if aim.states is not None:
-        aim = aim._replace(states=jnp.broadcast_to(aim.states, (N + 1, n)))
-    if aim.inputs is not None:
-        aim = aim._replace(inputs=jnp.broadcast_to(aim.inputs, (N, m)))
-    if aim.forecast is not None:
-        aim = aim._replace(forecast=jnp.broadcast_to(aim.forecast, (N, n)))
+    aim = aim.along(mpc)
     theta = aim.x0
     if mpc.input_in_state:
         previous = aim.previous_input
         aim = aim._replace(
-            previous_input=jnp.zeros(m, theta.dtype) if previous is None else previous
+            previous_input=jnp.zeros(mpc.system.m, theta.dtype) if previous is None else previous
         )
         theta = jnp.concatenate([theta, aim.previous_input])
     qp, z0 = _qp(controller, theta, aim), _tracked(c, aim)

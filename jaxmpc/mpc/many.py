@@ -49,7 +49,7 @@ from jaxmpc.batches import (
 from jaxmpc.checks import fail, require_kind, require_memory, require_step_type, whole
 from jaxmpc.mpc.condense import in_float64
 from jaxmpc.mpc.controller import Controller, plan_of_solution
-from jaxmpc.mpc.plan import Aim, Multipliers, Plan, flat_multipliers
+from jaxmpc.mpc.plan import Aim, Multipliers, Plan, checked_aim, flat_multipliers
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.admm import ADMM, DEFAULT, scaled_multipliers
@@ -80,6 +80,8 @@ def solve_many(
     x0s: Reals,
     solver: ADMM = DEFAULT,
     *,
+    reference: Reals | None = None,
+    input_reference: Reals | None = None,
     dtype: DTypeLike | None = None,
     chunk: int | None = None,
     transfer: bool = True,
@@ -90,7 +92,8 @@ def solve_many(
     some of which cannot be written into.
 
     Where input rates are limited or weighted x0s may be (B, n + m), with the previous inputs in the
-    last columns; (B, n) takes them as zero. The plans track the origin.
+    last columns; (B, n) takes them as zero. reference, input_reference: what all plans track, as in
+    `solve`, None for zero; for one each take `jax.vmap` of `jm.solve`.
 
     mpc: the problem, or a Controller of it in float64, already condensed and factored, whose own
     solver counts. dtype: type of the ADMM iterates; None: that of `solver`, by default float32
@@ -129,29 +132,37 @@ def solve_many(
     each = 8 * (problem.horizon + 1) * (n + problem.system.m)
     require_memory("x0s", len(x0s) * each, "Solve some of them at a time")
     with jax.enable_x64(True):
+        aim = checked_aim(problem, np.zeros(n), reference, input_reference)
+        aim = jax.tree.map(partial(np.asarray, dtype=np.float64), aim).along(problem)
         if not isinstance(mpc, Controller):
             mpc = Controller(in_float64(mpc), solver)
         if x0s.shape[1] < p:
             x0s = np.pad(np.asarray(x0s), ((0, 0), (0, p - n)))
         if not len(x0s):
-            shapes = jax.eval_shape(jax.vmap(mpc.plan), np.zeros((1, p)))
+            shapes = jax.eval_shape(jax.vmap(mpc.plan), np.zeros((1, n)))
             empty = lambda s: (np if to_host else jnp).zeros((0, *s.shape[1:]), s.dtype)
             return jax.tree.map(empty, shapes)
-        return Batch(mpc, x0s, chunk, to_host, chosen).solve(transfer)
+        return Batch(mpc, aim, x0s, chunk, to_host, chosen).solve(transfer)
 
 
 class Batch:
     """Plans from the states x (B, p), which lie in NumPy or on the device.
 
-    chunk: states that a program takes at once; devices share them. answer: the plans so far, B in
-    front, in NumPy (to_host) or on the device.
+    aim: what they track. chunk: states that a program takes at once; devices share them. answer:
+    the plans so far, B in front, in NumPy (to_host) or on the device.
     """
 
     def __init__(
-        self, controller: Controller, x: Any, chunk: int | None, to_host: bool, devices: Devices
+        self,
+        controller: Controller,
+        aim: Aim,
+        x: Any,
+        chunk: int | None,
+        to_host: bool,
+        devices: Devices,
     ) -> None:
         self.x, self.to_host, self.devices = x, to_host, devices
-        self.controller = jax.device_put(controller, placement(devices))
+        self.given = jax.device_put((controller, aim), placement(devices))
         on_cpu = default_platform() == "cpu"
         # Elsewhere than on a CPU two chunks at once: one is computed while the other is copied.
         self.together = workers() if on_cpu and devices is None else 2
@@ -171,9 +182,9 @@ class Batch:
         left = np.arange(B)
         # (On GPUs the solver's kernels take less time than the laws and the host's indices would.)
         on_cpu = default_platform() == "cpu"
-        if transfer and self.to_host and on_cpu and B >= MANY and transferable(self.controller):
+        if transfer and self.to_host and on_cpu and B >= MANY and transferable(self.given[0]):
             left = self._transfer()
-        self._run(_plans(self.devices), (self.controller,), left)
+        self._run(_plans(self.devices), self.given, left)
         assert self.answer is not None
         return self.answer
 
@@ -181,10 +192,10 @@ class Batch:
         """Solve from some states, and from those that follow them; return the indices of those that
         are left."""
         index, cells = choose(self.x)
-        self._run(_plans(self.devices), (self.controller,), index)
+        self._run(_plans(self.devices), self.given, index)
         solved = jax.tree.map(lambda v: v[padded(index, len(cells.states))], self.answer)
-        laws = laws_of(self.controller, solved.multipliers, solved.status)
-        arguments = (self.controller, laws, cells)
+        laws = laws_of(*self.given, solved.multipliers, solved.status)
+        arguments = (*self.given, laws, cells)
         left = np.delete(np.arange(len(self.x)), index)
         if len(left) >= TRIAL * self.chunk:
             few = np.random.default_rng(0).choice(left, self.chunk, replace=False)
@@ -301,24 +312,29 @@ def _one_after_other(devices: Devices, total: int) -> Compiled:
 
 @functools.cache
 def _plans(devices: Devices) -> Compiled:
-    """Return the program (controller, x (B, p)) → plans."""
+    """Return the program (controller, aim, x (B, p)) → plans."""
 
-    def plan(controller: Controller, x: Array) -> Plan:
-        n = controller.mpc.system.n
-        previous = x[n:] if controller.mpc.input_in_state else None
-        return controller.plan(x[:n], previous_input=previous)
+    def plan(controller: Controller, aim: Aim, x: Array) -> Plan:
+        aim = from_coordinates(controller.mpc, aim, x)
+        return controller.plan(aim.x0, aim.states, None, aim.inputs, aim.previous_input)
 
-    return over_devices(jax.vmap(plan, (None, 0)), devices, (False, True))
+    return over_devices(jax.vmap(plan, (None, None, 0)), devices, (False, False, True))
+
+
+def from_coordinates(mpc: MPC, aim: Aim, theta: Array) -> Aim:
+    """Return the aim of a plan from θ (p,)."""
+    x0, previous = jnp.split(theta, [mpc.system.n])
+    return aim._replace(x0=x0, previous_input=previous if mpc.input_in_state else None)
 
 
 @functools.cache
 def _follow(devices: Devices) -> Compiled:
-    """Return the program (controller, laws, cells, x (B, p)) → plans of `follow`."""
+    """Return the program (controller, aim, laws, cells, x (B, p)) → plans of `follow`."""
 
-    def run(controller: Controller, laws: Laws, cells: Cells, x: Array) -> Plan:
-        return map_blocks(jax.vmap(partial(follow, controller, laws, cells)), x)
+    def run(controller: Controller, aim: Aim, laws: Laws, cells: Cells, x: Array) -> Plan:
+        return map_blocks(jax.vmap(partial(follow, controller, aim, laws, cells)), x)
 
-    return over_devices(run, devices, (False, False, False, True))
+    return over_devices(run, devices, (False, False, False, False, True))
 
 
 @pytree
@@ -406,14 +422,15 @@ def choose(x: Any) -> tuple[np.ndarray, Cells]:
 
 
 @jax.jit
-def laws_of(controller: Controller, multipliers: Multipliers, status: Array) -> Laws:
+def laws_of(controller: Controller, aim: Aim, multipliers: Multipliers, status: Array) -> Laws:
     """Return the laws of plans with these multipliers and this status, S in front."""
     c, f = controller.condensed, controller.factor
+    constant = c.qp(jnp.zeros(c.F.shape[1]), aim.states, aim.inputs).q
     m, most = len(f.E), most_rows(c.C)
     finite = lambda bound: jnp.where(jnp.isfinite(bound), bound, 0.0)
     # v − b of the upper and of the lower bound, in (θ, 1).
     linear = f.E[:, None] * c.D - matmul(f.A, matmul(f.T.T, c.F))
-    shift = f.E * c.d - matmul(matmul(c.f, f.T), f.A.T)
+    shift = f.E * c.d - matmul(matmul(constant, f.T), f.A.T)
     beyond = lambda bound: jnp.column_stack([linear, shift - f.E * finite(bound)])
     upper, lower = beyond(c.upper), beyond(c.lower)
 
@@ -438,14 +455,13 @@ def laws_of(controller: Controller, multipliers: Multipliers, status: Array) -> 
     return jax.vmap(law)(flat, status == Status.SOLVED)
 
 
-def follow(controller: Controller, laws: Laws, cells: Cells, theta: Array) -> Plan:
+def follow(controller: Controller, aim: Aim, laws: Laws, cells: Cells, theta: Array) -> Plan:
     """Return the plan from θ (p,) by the law of a solved state nearby: SOLVED where its residuals
     are as small as those at which the solver ends, or ITERATION_LIMIT, also where there is no law.
     """
     c, f = controller.condensed, controller.factor
     i = cells.nearest(theta)
     y = jnp.where(i < 0, jnp.nan, laws.evaluate(i, theta, len(f.E)))
-    found, fault = from_multipliers(c.qp(theta), f, y)
-    x0, previous = jnp.split(theta, [controller.mpc.system.n])
-    aim = Aim(x0, previous_input=previous if controller.mpc.input_in_state else None)
+    found, fault = from_multipliers(c.qp(theta, aim.states, aim.inputs), f, y)
+    aim = from_coordinates(controller.mpc, aim, theta)
     return plan_of_solution(controller, theta, aim, found, fault, share=NEAR)

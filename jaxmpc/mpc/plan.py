@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.arrays import Reals, as_array, host_array
-from jaxmpc.checks import fail, require_kind
+from jaxmpc.checks import fail, require_finite, require_kind, require_shape
 from jaxmpc.mpc.problem import MPC, at_stage, weights_of
 from jaxmpc.mpc.rows import Block, Layout, blocks, given_blocks, layout, row_count, row_table, split
 from jaxmpc.pytrees import named_pytree, pytree
@@ -41,6 +41,17 @@ class Aim(NamedTuple):
     forecast: Any = None
     targets: tuple[Array, ...] = ()
     slopes: tuple[Array, Array] | None = None
+
+    def along(self, mpc: MPC) -> "Aim":
+        """Return the aim with references and forecast at every step."""
+        N, n, m = mpc.horizon, mpc.system.n, mpc.system.m
+        each = {"states": (N + 1, n), "inputs": (N, m), "forecast": (N, n)}
+        filled: dict[str, Any] = {
+            name: jnp.broadcast_to(getattr(self, name), shape)
+            for name, shape in each.items()
+            if getattr(self, name) is not None
+        }
+        return self._replace(**filled)
 
 
 def checked_aim(
@@ -87,6 +98,27 @@ def reference_shapes(
     n, last = mpc.system.n, N + steps - 1
     inputs, forecast = [(m,), (last, m)], [(n,), (last, n)]
     return {"reference": states, "input_reference": inputs, "forecast": forecast}
+
+
+# What plans track, by the names of the arguments of `solve`; none that stand for zero.
+References = dict[str, Any]
+
+
+def constant_references(
+    mpc: MPC, reference: Reals | None, input_reference: Reals | None
+) -> References:
+    """Return references (n,) and (m,) that hold at all time steps as arrays of float64, those that
+    are given; ValueError that names argument, shape and cure for others."""
+    sizes = {"reference": mpc.system.n, "input_reference": mpc.system.m}
+    given = {"reference": reference, "input_reference": input_reference}
+    found = {}
+    for name, value in given.items():
+        if value is not None:
+            cure = "Give one number each: where the loops stay"
+            require_shape(name, value, (sizes[name],), cure)
+            require_finite(name, value)
+            found[name] = host_array(name, value)
+    return found
 
 
 def checked_array(name: str, value: Any, shapes: Sequence[tuple[int, ...]]) -> Any:

@@ -26,6 +26,7 @@ from jaxmpc.explicit.law_at_states import Law, RegionLaw
 from jaxmpc.feasible.plan_polytope import CenteredPolytope
 from jaxmpc.feasible.policy_problem import problem_of
 from jaxmpc.grids import grid
+from jaxmpc.mpc.plan import References, constant_references
 from jaxmpc.mpc.problem import HARD, MPC
 from jaxmpc.recursion.counterexamples import (
     STARTS,
@@ -61,6 +62,8 @@ def recursive_feasibility(
     mpc: MPC,
     x0s: Reals | None = None,
     *,
+    reference: Reals | None = None,
+    input_reference: Reals | None = None,
     steps: int = 20,
     search: bool = True,
     max_regions: int = 2000,
@@ -83,14 +86,15 @@ def recursive_feasibility(
 
     x0s: sample states (B, n), or (B, n + m) with the previous input, one within the input limits,
     where input rates are limited; None: none where the law is proved, else a grid over X_N, random
-    states in more than three dimensions. steps: length of the closed loops x⁺ = A x + B u_0(x) + c
-    from each sample. search: where regions are incomplete look for a counterexample by gradient
-    ascent too. max_regions: critical regions to enumerate at most (0: none). seconds: time limit of
-    the whole call; 1. may take half of it, 2. half of what is left. What is not settled by then is
-    open, and samples that are not labelled or followed to the end are undecided. Compiling, one
-    step of all closed loops, and a linear program cannot be interrupted: a stage that has to
-    compile is left out where less than the seconds above are left. progress: print each stage on
-    stderr.
+    states in more than three dimensions. reference (n,), input_reference (m,): what the law tracks
+    at all time steps, None for zero; of the claims they change that on the law alone. steps: length
+    of the closed loops x⁺ = A x + B u_0(x) + c from each sample. search: where regions are
+    incomplete look for a counterexample by gradient ascent too. max_regions: critical regions to
+    enumerate at most (0: none). seconds: time limit of the whole call; 1. may take half of it, 2.
+    half of what is left. What is not settled by then is open, and samples that are not labelled or
+    followed to the end are undecided. Compiling, one step of all closed loops, and a linear program
+    cannot be interrupted: a stage that has to compile is left out where less than the seconds above
+    are left. progress: print each stage on stderr.
 
     Optima of linear programs are trusted to 1e-9, by bounds from their multipliers: relative to the
     distance of a facet of X_N from the centre. A state counts as outside X_N when it lies beyond a
@@ -111,7 +115,8 @@ def recursive_feasibility(
     critical regions.
     """
     budget = Budget.of(seconds, progress)
-    return examine(mpc, x0s, steps, search, max_regions, budget, budget.share(0.5))
+    references = constant_references(mpc, reference, input_reference)
+    return examine(mpc, x0s, steps, search, max_regions, budget, budget.share(0.5), references)
 
 
 def examine(
@@ -122,8 +127,10 @@ def examine(
     max_regions: int,
     budget: Budget,
     settled: float,
+    references: References,
 ) -> RecursionReport:
-    """Return the report of `recursive_feasibility`; settled: when its stage 1 has to end."""
+    """Return the report of `recursive_feasibility`; settled: when its stage 1 has to end.
+    references: what plans track, by argument."""
     require_kind("mpc", mpc, MPC)
     mpc.require_constant(SAME, *HARD)
     require_kind("search", search, bool, cure="Give True or False")
@@ -142,7 +149,7 @@ def examine(
     verdict = RegionVerdict.none(p)
     if max_regions and not claims.law.holds and np.isfinite(claims.volume):
         budget.say("critical regions of the law")
-        verdict = settle_by_regions(claims, max_regions, budget.share(0.5))
+        verdict = settle_by_regions(claims, max_regions, budget.share(0.5), **references)
         lost = verdict.lost
         if claims.law.holds is None:
             claims = replace(claims, law=verdict.claim)
@@ -171,7 +178,7 @@ def examine(
     regions, worst = verdict.regions, None
     region_law = None if regions is None else RegionLaw(regions, easy, chunk)
     complete = regions is not None and regions.complete
-    law = region_law if region_law is not None and complete else Law(mpc, easy, chunk)
+    law = Law(mpc, easy, chunk, **references) if region_law is None or not complete else region_law
     if region_law is not None and len(verdict.worst):
         budget.say(f"proof of the counterexample; compiles for some {PROOFS:.0f} s")
         by = ["regions"] * len(verdict.worst)
@@ -300,13 +307,16 @@ def smallest_horizon(
     mpc: MPC,
     max_horizon: int = 20,
     *,
+    reference: Reals | None = None,
+    input_reference: Reals | None = None,
     max_regions: int = 2000,
     seconds: float = 60.0,
     progress: bool = False,
 ) -> SmallestHorizon:
     """Try horizons 1, 2, … up to `max_horizon` with proofs alone (no samples, no search).
 
-    max_horizon: the largest to try. max_regions: critical regions to enumerate at most.
+    max_horizon: the largest to try. reference, input_reference: as in `recursive_feasibility`.
+    max_regions: critical regions to enumerate at most.
     seconds: time limit, after which larger horizons are left out (some linear programs are
     finished); a horizon takes a second or so with two states, minutes with hundreds of facets or
     thousands of regions. progress: print each horizon on stderr. The horizon of `mpc` itself has
@@ -317,6 +327,7 @@ def smallest_horizon(
     require_kind("mpc", mpc, MPC)
     mpc.validate()
     mpc.require_constant(SAME, *HARD)
+    references = constant_references(mpc, reference, input_reference)
     max_horizon = whole("max_horizon", max_horizon, 1)
     max_regions = whole("max_regions", max_regions, 0)
     least: int | None = None
@@ -335,7 +346,7 @@ def smallest_horizon(
             claims = settle_claims(changed, problem, budget.deadline)
             law = claims.law
             if law.holds is None and least is None and max_regions and np.isfinite(claims.volume):
-                law = settle_by_regions(claims, max_regions, budget.deadline).claim
+                law = settle_by_regions(claims, max_regions, budget.deadline, **references).claim
         except ValueError as error:  # too ill-conditioned: the other horizons stay settled
             reasons[N] = Claim(None, f"not settled ({error})")
             continue

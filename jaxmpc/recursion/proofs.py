@@ -2,6 +2,7 @@
 
 import time
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -284,9 +285,12 @@ class RegionVerdict:
         return cls(Claim(None, reason), np.nan, np.zeros((0, dimension)), None)
 
 
-def settle_by_regions(claims: Claims, max_regions: int, deadline: float = np.inf) -> RegionVerdict:
+def settle_by_regions(
+    claims: Claims, max_regions: int, deadline: float = np.inf, **references: Any
+) -> RegionVerdict:
     """Settle the law claim by at most `max_regions` critical regions, found before the deadline.
 
+    references: `reference` and `input_reference` that the law tracks, None for zero.
     On a region x⁺ is affine and its distance from X_N convex, hence largest at a vertex: where the
     regions are complete, the worst vertex is the worst state of X_N.
     """
@@ -297,7 +301,8 @@ def settle_by_regions(claims: Claims, max_regions: int, deadline: float = np.inf
         if mpc.input_in_state:
             what = "its law depends on the previous input, and on disturbances"
             fail("mpc", what, "Regions of both are not compared with X_N")
-        found = critical_regions(mpc, max_regions=max_regions, seconds=deadline - time.monotonic())
+        left = deadline - time.monotonic()
+        found = critical_regions(mpc, max_regions=max_regions, seconds=left, **references)
     except ValueError as error:
         return RegionVerdict.none(claims.problem.dimension, f"no critical regions ({error})")
     A, B, c = host_matrices(mpc.system)

@@ -231,7 +231,7 @@ class RobotSetting:
             states = self.problem.view.states(self.x0s) - self.reference
             end = time.monotonic() + search_seconds
             budget, steps = Budget.of(np.inf), max(self.steps - 1, 1)
-            report = examine(self.deviations(), states, steps, False, 0, budget, end)
+            report = examine(self.deviations(), states, steps, False, 0, budget, end, {})
         linear = linear if gap is None else linear.refine(gap)
         return RobotMap(self.robot, self.claim, linear, report, loops, self.steps, self.reference)
 

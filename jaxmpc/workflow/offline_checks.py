@@ -21,7 +21,7 @@ from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.grids import grid
 from jaxmpc.mpc.condense import in_float64
 from jaxmpc.mpc.controller import Controller
-from jaxmpc.mpc.plan import checked_aim
+from jaxmpc.mpc.plan import References, checked_aim
 from jaxmpc.mpc.policy_rows import condensed_plan
 from jaxmpc.mpc.problem import HARD, MPC, harden
 from jaxmpc.mpc.rows import given_blocks, row_table
@@ -137,10 +137,8 @@ class SetPoint:
             text.append(f"breaks the {name}")
         if not np.any(self.drift) and not self.broken:
             text.append("an equilibrium that keeps all limits")
-        text.append(
-            "closed loops go there, and the penalty is of the law with this set-point; of its"
-        )
-        text.append("claim and of stability the report speaks as of the law about the origin")
+        text.append("the law, its penalty and closed loops are those that go there; stability is")
+        text.append("that of the law whose set-point is the origin")
         return "\n".join(text)
 
 
@@ -149,9 +147,9 @@ class OfflineReport:
     """Everything that is known of an MPC problem before it runs; `print` shows it.
 
     feasible_set: map of initial states with proofs, of the problem with its soft rows hard; volume:
-    lower and upper bound of its volume. penalty: the report of `exact_penalty`. recursion,
-    terminal: those of `recursive_feasibility` and `verify_terminal`, of the law whose set-point is
-    the origin. loops: closed loops to the set-point that were simulated, not proved. None, where
+    lower and upper bound of its volume. recursion, penalty: the reports of `recursive_feasibility`
+    and `exact_penalty`. terminal: that of `verify_terminal`, of the law whose set-point is the
+    origin. loops: closed loops to the set-point that were simulated, not proved. None, where
     they do not apply or the time was over. set_point: where the loops go, and what moves away from
     there.
     notes: the reasons for what is None.
@@ -238,7 +236,7 @@ def offline_report(
             those of `recursive_feasibility` for its test.
         reference, input_reference: the set-point of closed loops, (n,) and (m,); None for zero. It
             is shown, with whether it is an equilibrium inside the limits. It moves the optimal
-            law: its claim and its stability are those of the origin as set-point.
+            law; what is said of stability is said of the origin as set-point.
         steps: length of the closed loops. loops: how many of them.
         K: terminal law to verify, (m, n); None: that of the LQR.
         seconds: time limit of the whole call. Linear programs take seconds, thousands of facets or
@@ -274,12 +272,12 @@ def offline_report(
     proofs = replace(budget, deadline=budget.deadline - reserved)
     part = replace(proofs, deadline=proofs.share(2 / 3))
     follow = x0s if problem.dimension > 3 else None
-    examined = partial(examine, hard, follow, steps, True, 2000, part, part.share(0.75))
+    aims: References = {"reference": set_point.x, "input_reference": set_point.u}
+    examined = partial(examine, hard, follow, steps, True, 2000, part, part.share(0.75), aims)
     recursion = _or_note(notes, "recursion", examined)
     budget.say("exact penalty, by critical regions")
     left = proofs.deadline - time.monotonic()
-    aimed = partial(exact_penalty, mpc, reference=set_point.x, input_reference=set_point.u)
-    penalty = _or_note(notes, "penalty", partial(aimed, seconds=left))
+    penalty = _or_note(notes, "penalty", partial(exact_penalty, mpc, seconds=left, **aims))
     fmap = mapped(problem, x0s, budget)
     inside = np.zeros((0, problem.dimension)) if fmap is None else fmap.x0s[fmap.label == 1]
     followed = None

@@ -8,6 +8,7 @@ import pytest
 import jaxmpc as jm
 from jaxmpc.batches import program_size
 from jaxmpc.mpc.many import Batch
+from jaxmpc.mpc.plan import Aim
 
 pytestmark = pytest.mark.usefixtures("as_of_many")
 
@@ -127,7 +128,7 @@ def test_any_numbers_of_states_need_few_programs():
     assert np.all(sizes <= np.where(counts < 128, np.maximum(2 * counts, 8), 1.125 * counts))
     with jax.enable_x64(True):
         controller = jm.Controller(problems.joint_o_inf(3))
-    made = lambda count, **given: Batch(controller, np.zeros((count, 2)), **given).chunk
+    made = lambda count, **given: Batch(controller, Aim(None), np.zeros((count, 2)), **given).chunk
     on_host = {"chunk": None, "to_host": True, "devices": None}
     assert len({made(count, **on_host) for count in range(1, 300)}) <= 15
     assert made(7000, **on_host | {"chunk": 100}) == 100

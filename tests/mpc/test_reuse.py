@@ -1,5 +1,7 @@
 """Plans that follow the laws of solved neighbours: those of the solver, judged by themselves."""
 
+from dataclasses import replace
+
 import jax
 import numpy as np
 import problems
@@ -84,7 +86,7 @@ def test_plans_are_those_of_the_solver(mpc, states, solved, few):
     same_plans(found, solved)
     assert few[0][1] <= COUNT // 16  # the solved ones first
     infeasible = np.sum(solved.status == jm.Status.PRIMAL_INFEASIBLE)
-    assert few[-1][0] == 1 and few[-1][1] <= infeasible + COUNT // 3
+    assert few[-1][0] == 2 and few[-1][1] <= infeasible + COUNT // 3
     good = np.flatnonzero(found.status == jm.Status.SOLVED)
     for i in good[:: len(good) // 40]:
         plan = jax.tree.map(lambda v, i=i: v[i], found)
@@ -103,7 +105,7 @@ def test_most_follow(mpc, states, solved, few):
     good = states[solved.status == jm.Status.SOLVED]
     many = np.concatenate([good] * 3)[:COUNT]
     jm.solve_many(mpc, many)
-    assert few[-1][0] == 1 and few[-1][1] <= COUNT // 2
+    assert few[-1][0] == 2 and few[-1][1] <= COUNT // 2
 
 
 @pytest.mark.parametrize("tolerance", [1e-3, pytest.param(1e-9, marks=pytest.mark.slow)])
@@ -123,7 +125,7 @@ def test_followed_plans_are_as_precise_as_solved_ones(mpc, states, few):
     right, as beside the border of its region, gives another plan within a loose tolerance."""
     solver = jm.ADMM(eps=1e-2)
     found = jm.solve_many(mpc, states, solver, chunk=64)
-    assert few[1][0] == 3  # some followed
+    assert few[1][0] == 4  # some followed
     expected = jm.solve_many(mpc, states, solver, transfer=False, chunk=64)
     same_plans(found, expected, 1e-4)  # of eps 1e-2; by the tolerance alone 0.2 were apart
 
@@ -164,7 +166,7 @@ def test_it_is_given_up_where_few_follow(mpc, states, solved, few, monkeypatch):
     monkeypatch.setattr(many, "TRIAL", 1)
     monkeypatch.setattr(many, "LEAST", 1.1)
     same_plans(jm.solve_many(mpc, states, chunk=64), solved)
-    assert [arguments for arguments, _ in few] == [1, 3, 1] and few[1][1] == 64
+    assert [arguments for arguments, _ in few] == [2, 4, 2] and few[1][1] == 64
 
 
 @pytest.mark.slow
@@ -200,7 +202,28 @@ def test_rates_in_the_state(few):
                  input_rate_limit=0.7, input_rate_weight=np.array([[0.3]]))  # fmt: skip
     x = np.random.default_rng(1).uniform([-1, -1.5, -2], [1, 1.5, 2], (COUNT, 3))
     same_plans(jm.solve_many(mpc, x), jm.solve_many(mpc, x, transfer=False))
-    assert any(arguments == 3 for arguments, _ in few)
+    assert any(arguments == 4 for arguments, _ in few)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("rates", [False, True])
+def test_references_of_all_plans(few, rates):
+    """Solved and followed plans are those of `solve`, for a target and a trajectory."""
+    mpc, random = problems.joint_o_inf(4), np.random.default_rng(0)
+    r, s = np.array([0.6, 0.0]), random.uniform(-0.3, 0.3, (4, 1))
+    if rates:
+        mpc, r = replace(mpc, input_rate_weight=[0.3]), np.linspace(0, 0.9, 10).reshape(5, 2)
+    x = random.uniform([-1, -1, -1], [1, 1, 1], (COUNT, 3))[:, : mpc.dimension]
+    found = jm.solve_many(mpc, x, reference=r, input_reference=s, chunk=128)
+    assert few[1][0] == 4  # some followed
+    with jax.enable_x64(True):
+        one = lambda x: jm.solve(
+            mpc, x[:2], r, input_reference=s, previous_input=x[2:] if rates else None
+        )
+        some = jax.vmap(one)(x[:128])
+    same_plans(jax.tree.map(lambda v: v[:128], found), jax.tree.map(np.asarray, some))
+    with pytest.raises(ValueError, match="reference: shape"):
+        jm.solve_many(mpc, x, reference=np.zeros(3))
 
 
 def test_cells():

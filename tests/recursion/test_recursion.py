@@ -551,6 +551,29 @@ class TestSlow:
         assert (found.horizon, found.strong) == (None, None)
         assert str(found) == "none up to 2 is proved"
 
+    @pytest.mark.parametrize("regions", [2000, pytest.param(0, marks=pytest.mark.long)])
+    def test_the_law_of_a_reference(self, regions):
+        """It is that of the problem written in deviations, and loses more than the origin's."""
+        system = jm.LinearSystem([[1.0, 1], [0, 1]], [[0.5], [1]])
+        box, r = jm.Box([-5, -5], [5, 5]), np.array([4.8, 0])
+        mpc = jm.MPC(system, [1.0, 1], 1.0, 2, box, jm.Box(-1, 1))
+        about = replace(mpc, states=jm.Box(box.lower - r, box.upper - r))
+        random = np.random.default_rng(0)
+        x0s = random.uniform(-5, 5, (200, 2))
+        how = {"max_regions": regions, "search": False, "steps": 3}
+        found = recursive_feasibility(mpc, x0s, reference=r, **how)
+        moved = recursive_feasibility(about, x0s - r, **how)
+        np.testing.assert_array_equal(found.loops.lost_at, moved.loops.lost_at)
+        np.testing.assert_allclose(found.loops.inputs, moved.loops.inputs, atol=1e-6)
+        assert np.nanmax(np.abs(found.loops.inputs)) > 0.9
+        assert holds(found) == holds(moved)
+        if regions:
+            assert found.lost_by_law == pytest.approx(moved.lost_by_law, rel=1e-9)
+            assert found.lost_by_law > found.lost_by_any + 0.1
+            assert smallest_horizon(mpc, 3, reference=r).horizon is None
+        with pytest.raises(ValueError, match="reference: shape"):
+            recursive_feasibility(mpc, reference=[1.0])
+
     def test_previous_input_is_part_of_the_state(self):
         mpc = replace(problems.lecture(), input_rate_limit=0.2)
         report = recursive_feasibility(mpc, steps=3)

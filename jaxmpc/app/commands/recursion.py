@@ -51,11 +51,17 @@ class Recursion(RecursionOptions):
             max_regions=settings.regions,
             seconds=seconds,
             progress=True,
+            **config.references(),
         )
         rows, least = [], None
         if self.smallest is not None:
             least = smallest_horizon(
-                mpc, self.smallest, max_regions=settings.regions, seconds=seconds, progress=True
+                mpc,
+                self.smallest,
+                max_regions=settings.regions,
+                seconds=seconds,
+                progress=True,
+                **config.references(),
             )
             rows.append(("smallest horizon", str(least)))
         save_report(self.output, report, config.to_dict("recursion"), least)
@@ -71,7 +77,7 @@ class Recursion(RecursionOptions):
                 rows.append(("picture", f"none: {error}"))
         print(report)
         if config.references():
-            rows.append(("set-point", "the claim on the law is of the origin, not of [reference]"))
+            rows.append(("set-point", "the law is that of [reference]"))
         rows.append(("total", f"{time.perf_counter() - begun:.2f} s with set-up and files"))
         rows.append(("files", " ".join(str(self.output / name) for name in files)))
         print_table(rows, 20)
