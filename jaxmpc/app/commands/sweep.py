@@ -174,7 +174,7 @@ def conclude(found: StoredMap, config: configs.Config, output: Path, start: floa
     write_results(output / "summary.json", summary)
     what = {1: "length", 2: "area"}.get(len(axes), "volume")
     unit = found.bounds.mpc.volume_unit(axes)
-    total = sum(found.counts.values())
+    total, gap = sum(found.counts.values()), 1 - low / high if high > low else 0.0
     rows = [
         (name, f"{count:>12,}  {count / total:7.2%}")
         for name, count in found.counts.items()
@@ -184,7 +184,7 @@ def conclude(found: StoredMap, config: configs.Config, output: Path, start: floa
         ("compile", f"{found.timing.compile_seconds:.2f} s"),
         run_row(found),
         (f"{what} from", f"{low:.9g}{unit} (inner bound)"),
-        (f"{what} to", f"{high:.9g}{unit} (outer bound, gap {high - low:.2g})"),
+        (f"{what} to", f"{high:.9g}{unit} (outer bound, gap {gap:.1g} of it)"),
         ("total", f"{seconds:.2f} s with bounds and files"),
         ("files", " ".join(files)),
     ]
