@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import highspy
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from jaxmpc.checks import fail
 
@@ -44,6 +45,9 @@ ROUNDING = 1e-11
 FAR = 1e3
 # Sides of rows that are smaller are zeros.
 UNDERFLOW = 1e-250
+# The logarithm of how much smaller a number may be than others of its kind, in the units that are
+# given, to count as a length or an entry: else it is the rounding of 0, as 0.1 + 0.2 − 0.3 is.
+GIVEN = 44
 _SWEEPS = 40  # of the least squares of `scaling`; fewer where they end before
 
 
@@ -344,6 +348,7 @@ def scaling(G: np.ndarray, g: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     with np.errstate(divide="ignore", invalid="ignore"):
         # What is added against underflow, as to bounds of proofs, is no distance.
         every, distance = np.log2(np.abs(G)), np.log2(np.where(np.abs(g) > UNDERFLOW, np.abs(g), 0))
+        distance = np.where(_rounding_sides(G, every, distance), -np.inf, distance)
         reach = np.where(np.isfinite(every), distance[:, None] - every, np.inf)
         reach[~np.isfinite(distance)] = np.inf
         L = np.where(_rounding_entries(every, distance, reach), -np.inf, every)
@@ -381,21 +386,61 @@ def scaling(G: np.ndarray, g: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.exp2(-np.round(top)), np.exp2(column)
 
 
+def _rounding_sides(G: np.ndarray, L: np.ndarray, distance: np.ndarray) -> np.ndarray:
+    """Return which sides g_i are rounding of 0; L and distance are the logarithms of [G, g].
+
+    They are `GIVEN` times smaller, beside the largest entry of their row, than other sides of rows
+    with the same coordinates, or coordinates that share a row with these; of a coordinate with one
+    bound and no other row, than other sides at all. A small set is no rounding: that in which a
+    coordinate has two such bounds of its own.
+    """
+    top = L.max(axis=1, initial=-np.inf)
+    size = np.where(np.isfinite(top), distance - top, -np.inf)
+    known = np.isfinite(size)
+    if not known.any() or size[known].min() >= size[known].max() - GIVEN:
+        return np.zeros(len(size), bool)
+    there = np.isfinite(L) & (L > top[:, None] - GIVEN)
+    _, part = connected_components(there.T.astype(np.int64) @ there)
+    own = np.where(there.any(axis=1), part[there.argmax(axis=1)], -1)
+    most = np.full(len(part) + 1, -np.inf)
+    np.maximum.at(most, own[known], size[known])
+    at, alone = there.argmax(axis=1), there.sum(axis=1) == 1
+    positive = G[np.arange(len(G)), at] > 0
+    for j in np.unique(at[alone]):
+        here = at == j
+        if np.all(there[:, j] == (alone & here)) and len(set(positive[alone & here])) == 1:
+            most[part[j]] = size[known].max()
+    small = known & (size < most[own] - GIVEN)
+    for j in np.unique(at[alone & small]):
+        here = alone & small & (at == j)
+        if len(set(positive[here])) == 2:
+            small &= ~here
+    return small
+
+
 def _rounding_entries(L: np.ndarray, distance: np.ndarray, reach: np.ndarray) -> np.ndarray:
     """Return which entries of G are rounding; L and distance are the logarithms of [G, g].
 
     They are 1e10 times smaller than the largest of their row where each x_j is in units of how far
     along it the nearest row lets a point go. Then either the entry or the distance of that row is
     rounding: that which is smaller beside the largest entry of its row. In many rows such entries
-    would pass for another unit of their column.
+    would pass for another unit of their column. Of a coordinate that no other distance is known of
+    those are rounding that are `GIVEN` times smaller in the units that are given, where other rows
+    have larger ones.
     """
-    nearest, top = reach.min(axis=0, initial=np.inf), L.max(axis=1, initial=-np.inf)
+    top = L.max(axis=1, initial=-np.inf)
+    tiny = np.isfinite(L) & (L < top[:, None] - GIVEN)
+    if tiny.any():
+        large = np.isfinite(L) & ~tiny
+        tiny &= large.any(axis=0) & ~np.isfinite(np.where(large, reach, np.inf)).any(axis=0)
+        reach = np.where(tiny, np.inf, reach)
+    nearest = reach.min(axis=0, initial=np.inf)
     known = np.isfinite(nearest)
     if not known.any():
-        return np.zeros(L.shape, bool)
+        return tiny
     scaled = np.where(known, L + nearest, -np.inf)
     small = scaled - scaled.max(axis=1, keepdims=True) < -33
-    return known & small & (L - top[:, None] < (distance - top)[reach.argmin(axis=0)])
+    return tiny | (known & small & (L - top[:, None] < (distance - top)[reach.argmin(axis=0)]))
 
 
 def maximise(d: np.ndarray, G: np.ndarray, g: np.ndarray) -> Optimum:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+import jaxmpc as jm
 from jaxmpc.sets import lp
 from jaxmpc.sets.lp import Model, Program, scaling
 
@@ -99,3 +100,50 @@ def test_a_set_is_unbounded_where_only_rounding_closes_it(spread):
     low, high = program.bounds()
     assert high[0] == np.inf
     np.testing.assert_allclose([low[0], low[1], high[1]] * unit[[0, 1, 1]], [-1.25, -1, 1])
+
+
+@pytest.mark.parametrize("rounding", [0.1 + 0.2 - 0.3, 1e-25])
+def test_a_side_that_is_rounding_of_zero_is_no_length(rounding):
+    """Sets with a row through 0 are those with rounding in its place, in all that is asked."""
+    random = np.random.default_rng(0)
+    looked = 0
+    while looked < 25:
+        n = int(random.choice([2, 2, 3]))
+        H = random.integers(-2, 3, (n + int(random.integers(1, 4)), n)).astype(float)
+        h = random.integers(1, 4, len(H)).astype(float)
+        h[i := random.integers(len(h))] = 0.0
+        if not H.any(axis=1).all():
+            continue
+        exact = jm.Polytope(H, h)
+        if exact.affine_dimension() < n or not exact.is_bounded():
+            continue
+        looked += 1
+        h[i] = rounding
+        found = jm.Polytope(H, h)
+        d = random.integers(-2, 3, (3, n)) + 0.1
+        assert found.is_bounded()
+        np.testing.assert_allclose(found.support(d), exact.support(d), atol=1e-9)
+        np.testing.assert_allclose(found.volume(), exact.volume(), rtol=1e-9)
+        box = [end for P in (found, exact) for end in P.bounding_box().bounds()]
+        np.testing.assert_allclose(box[:2], box[2:], atol=1e-9)
+        less = jm.Polytope(d, exact.support(d) - 0.01)
+        assert not found <= less
+
+
+def test_rounding_closes_nothing_and_opens_nothing():
+    """A side on one side only; sums that leave some; entries beside facets through 0."""
+    for e in (0.0, 1e-17):
+        assert jm.Polytope([[1, 0], [-1, 0], [0, 1]], [1, 1, e]).support([1, -1]) == np.inf
+        low = jm.Polytope([[1, 0], [-1, 0], [0, 1], [0, -1]], [1, 1, e, 1])
+        assert low.support([1, -1]) == pytest.approx(2)
+        difference = jm.Polytope([[1, -1], [-1, 1], [1, 1], [-1, -1]], 5.0 * np.ones(4)) - low
+        np.testing.assert_allclose(difference.h, [3, 4, 4, 3])
+        corner = jm.Polytope([[-1, 1], [-1, -1], [1, e]], [0, 0, 1])
+        np.testing.assert_allclose(corner.bounding_box().bounds(), [[0, -1], [1, 1]], atol=1e-12)
+    half = jm.Box([-np.inf, -0.7], [0.9, 1.9])
+    total = half + jm.sets.Zonotope([-1.1, 2.1], [[-0.2], [0.5]])
+    assert total.support([1.0, 2.0]) == pytest.approx(8.6)
+    # Two bounds of a coordinate's own are a small set.
+    small = jm.Box([-1e-17, -1], [2e-17, 1])
+    np.testing.assert_allclose(small.volume(), 6e-17, rtol=1e-9)
+    np.testing.assert_allclose(small.to_polytope().support([1, 0]), 2e-17, rtol=1e-9)
