@@ -93,9 +93,8 @@ class FeasibleSamples:
     @cached_property
     def states(self) -> np.ndarray:
         """Return the states (count, n), or (x, u_{−1}), that the points stand for."""
-        if self.problem.dimension == self.mpc.dimension:
-            return self.x0s
-        return self.labels.start
+        whole = tuple(self.problem.view.axes) == tuple(range(self.mpc.dimension))
+        return self.x0s if whole else self.labels.start
 
     def solve(self, solver: ADMM = DEFAULT, **settings: Any) -> Plan:
         """Return the optimal plans from the samples; settings: those of `solve_many`."""
@@ -146,7 +145,7 @@ class FeasibleSamples:
             for name, value in self.arrays(plans).items()
         }
         # (Labels name previous inputs too where those have a weight alone.)
-        return xr.Dataset(data, coords={"state": list(self.mpc.labels)[: self.x0s.shape[1]]})
+        return xr.Dataset(data, coords={"state": list(self.mpc.labels)[: self.states.shape[1]]})
 
 
 def sample_feasible_set(

@@ -383,7 +383,9 @@ class Polytope(LinearSet):
             if not hull.basis.shape[1]:
                 point = M @ hull.shift + t
                 return Box(point, point).to_polytope()
-            return Polytope(hull.G, hull.g).image(M @ hull.basis, M @ hull.shift + t)
+            # Rounding of zeros would be a direction of its own.
+            along = cleaned(M @ hull.basis, np.abs(M) @ np.abs(hull.basis))
+            return Polytope(hull.G, hull.g).image(along, M @ hull.shift + t)
         H, h = np.zeros((0, k)), np.zeros(0)
         if len(own):
             inner = self._onto(M[own])

@@ -180,6 +180,20 @@ def test_a_data_set(samples, tmp_path):
         samples.arrays(jax.tree.map(lambda v: v[:1], plans))
 
 
+@pytest.mark.parametrize(("axes", "fixed"), [((1, 0), None), ((1,), [0.2, 0.0])])
+def test_states_are_in_the_order_of_the_problem(axes, fixed):
+    """Whatever order or part of the coordinates the points are in."""
+    mpc = replace(MPC, states=jm.Box([-1.0, -3.0], [1.0, 3.0]))
+    samples = sample_feasible_set(mpc, 200, axes=axes, fixed=fixed)
+    states = samples.states
+    np.testing.assert_allclose(states[:, list(axes)], samples.x0s)
+    if fixed is not None:
+        np.testing.assert_allclose(states[:, 0], fixed[0])
+    require_kept(mpc, replace(samples, x0s=states))
+    assert list(samples.to_xarray().state.values) == list(mpc.labels)
+    assert samples.solve().solved.mean() > 0.98
+
+
 def test_errors():
     mpc = problems.joint(3)
     for settings, message in [

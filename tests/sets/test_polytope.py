@@ -298,6 +298,19 @@ def test_image_and_preimage_against_support_functions(n, k):
     assert 0 < inside.all(axis=1).sum() < 2000
 
 
+@pytest.mark.parametrize("n", [2, 4])
+def test_images_of_planes_along_their_normals_are_points(n):
+    """Rounding is no direction: {x : a'x = 1} under a is {1}, and under two rows a line."""
+    for a in np.random.default_rng(0).integers(-3, 4, (20, n)).astype(float):
+        if a.any():
+            plane = Polytope(np.vstack([a, -a]), [1.0, -1.0])
+            image = plane.image(a[None])
+            np.testing.assert_allclose(image.support([[1.0], [-1.0]]), [1, -1])
+            assert image.affine_dimension() == 0
+            twice = plane.image(np.vstack([a, 0.3 * a]))
+            np.testing.assert_allclose(twice.support([[1.0, 0], [0, -1]]), [1, -0.3], atol=1e-9)
+
+
 def test_preimage_keeps_rows_and_works_unbounded():
     half = Polytope([[1, 0], [0, 1]], [2, INF], ("a", "b"))
     pulled = half.preimage([[1, 1, 0], [0, 0, 1]], [0.5, 7])

@@ -435,7 +435,9 @@ class Config:
     @_in_keys
     def _softened(self, mpc: MPC, rho: Any) -> MPC:
         if isinstance(rho, str):
-            rho = exact_penalty(mpc, **self.references()).advised
+            # Where some rows are soft already the penalty would be that of these alone.
+            whole = soften(mpc, 1.0) if mpc.soft else mpc
+            rho = exact_penalty(whole, **self.references()).advised
         return soften(mpc, rho)
 
     def build_solver(self) -> ADMM | None:
