@@ -8,7 +8,15 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxmpc.arrays import Reals, as_weight
-from jaxmpc.checks import number, require_kind, require_shape, whole
+from jaxmpc.checks import (
+    fail,
+    number,
+    require_finite,
+    require_kind,
+    require_shape,
+    require_symmetric_psd,
+    whole,
+)
 from jaxmpc.closed_loop.feedback import Feedback, model_of
 from jaxmpc.closed_loop.robot_controller import robot_mpc
 from jaxmpc.closed_loop.variations import free_motions, start_room
@@ -101,8 +109,10 @@ class Environment:
             usual = robot_mpc(robot, Q, R, 1, target=target, terminal_cost=None, exact=False)
             Q, R = usual.Q, usual.R
         Q, R = as_weight(Q, robot.n), as_weight(R, robot.m)
-        require_shape("Q", Q, (robot.n, robot.n), "Give a matrix, or its diagonal")
-        require_shape("R", R, (robot.m, robot.m), "Give a matrix, or its diagonal")
+        for name, weight, size in (("Q", Q, robot.n), ("R", R, robot.m)):
+            require_shape(name, weight, (size, size), "Give a matrix, or its diagonal")
+            require_finite(name, weight)
+            require_symmetric_psd(name, weight)
         x, u = robot.set_point(target)
         home, below, above = start_room(robot)
         room = (home, spread * below, spread * above)
@@ -111,7 +121,10 @@ class Environment:
         return cls(robot, reference, u, Q, R, *room, motions, length, stop_at_limits)
 
     def reset(self, key: Array) -> EnvironmentState:
-        """Return a random start."""
+        """Return a random start; key: of JAX, such as jax.random.key(0)."""
+        kind = getattr(key, "dtype", None)
+        if kind is None or not (kind == jnp.uint32 or jnp.issubdtype(kind, jax.dtypes.prng_key)):
+            fail("key", f"{key!r}", "Give a JAX key: jax.random.key(0)")
         aside = jax.random.uniform(key, (self.robot.n,), minval=-1.0, maxval=1.0)
         room = jnp.where(aside > 0, jnp.asarray(self.above), jnp.asarray(self.below))
         start = room * aside if self.motions is None else matmul(self.motions, room * aside)
@@ -119,7 +132,10 @@ class Environment:
 
     def at(self, x: Any) -> EnvironmentState:
         """Return the start of an episode at the state x (nq + nv,)."""
-        return self._state(jnp.asarray(x), jnp.zeros(()), jnp.asarray(0))
+        require_shape("x", x, (self.robot.state_size,), "One state; use jax.vmap for many")
+        x = jnp.asarray(x)
+        x = x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(jnp.zeros(()).dtype)
+        return self._state(x, jnp.zeros(()), jnp.asarray(0))
 
     def step(self, state: EnvironmentState, action: Any) -> EnvironmentState:
         """Return the state one control period later, under the action (m,)."""
@@ -171,6 +187,9 @@ class MPCPolicy:
 
     def __call__(self, observation: Any) -> Array:
         """Return the action (m,) for an observation (n,)."""
+        if hasattr(self.controller, "motion"):
+            what = f"is a {type(self.controller).__name__}, whose plans begin where the last ended"
+            fail("controller", what, "Call controller(x, before) with what it returned before")
         n = self.controller.mpc.system.n
         require_shape("observation", observation, (n,), "The coordinates; use jax.vmap for many")
         xi = jnp.asarray(observation, self.controller.dtype)

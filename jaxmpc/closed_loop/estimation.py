@@ -1,7 +1,9 @@
 """Noise of a plant and of its measurements, and the Kalman filter that estimates the state, with
 constant disturbances beside it."""
 
+from collections.abc import Mapping
 from dataclasses import replace
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import jax
@@ -72,8 +74,10 @@ class Noise:
             if kind == np.uint32 and np.shape(seed) == (2,):
                 return jnp.asarray(seed)
             if np.issubdtype(kind, np.integer) and np.shape(seed) == ():
-                return jax.random.PRNGKey(seed)
-        return fail("noise.seed", f"{seed!r}", "Give a whole number or one JAX key")
+                # JAX takes 32 bits of it, unless 64-bit mode is on.
+                if not concrete(seed) or -(2**31) <= int(seed) < 2**32:
+                    return jax.random.PRNGKey(seed)
+        return fail("noise.seed", f"{seed!r}", "Give a whole number below 2^32, or one JAX key")
 
     def of_loop(self, index: Any) -> "Noise":
         """Return the noise of loop `index` of many."""
@@ -322,12 +326,15 @@ class KalmanFilter:
             found[kind] = value
         return found
 
-    def _informed(self, d: Array) -> Any:
-        """Return the model with these disturbances in its numbers."""
+    def _informed(self, d: Array, numbers: Mapping[str, Any]) -> Any:
+        """Return the model with these disturbances, and with others of its own numbers, in its
+        numbers."""
         model = _robot_model(self.model)
-        if model is None or not self.estimates_numbers:
+        own = {} if model is None else model.robot.predictor.own
+        known = {name: value for name, value in numbers.items() if name in own}
+        if model is None or not (self.estimates_numbers or known):
             return self.model
-        return replace(model, numbers=self.numbers(d))
+        return replace(model, numbers={**self.numbers(d), **known})
 
     @property
     def linear_model(self) -> LinearSystem:
@@ -438,9 +445,16 @@ class KalmanFilter:
         P = matmul(left, matmul(P, left.T)) + matmul(L, matmul(V, L.T))
         return Belief(mean + matmul(L, error), P)
 
-    def predicted(self, belief: Belief, u: Array, known: Array | None = None) -> Belief:
+    def predicted(
+        self,
+        belief: Belief,
+        u: Array,
+        known: Array | None = None,
+        numbers: Mapping[str, Any] = MappingProxyType({}),
+    ) -> Belief:
         """Return the estimate one time step later, under the input u (m,) and what is known to be
-        added to the next state (n,), None for nothing."""
+        added to the next state (n,), None for nothing. numbers: of the robot's model at this step,
+        such as which feet stand."""
         mean, P = belief
         xi, d = self.split(mean)
         of_states = None
@@ -449,7 +463,7 @@ class KalmanFilter:
                 jnp.asarray(self.matrix(k), d.dtype) for k in ("input", "state")
             )
             u, of_states = u + matmul(on_inputs, d), matmul(on_states, d)
-        model = self._informed(d)
+        model = self._informed(d, numbers)
         after = model_step(model, xi, u)
         for more in (of_states, known):
             after = after if more is None else after + more
@@ -459,7 +473,7 @@ class KalmanFilter:
         A, B = (jnp.asarray(v, d.dtype) for v in _slopes(model, xi, u))
         A, _ = self._with_disturbances(A, B)
         if self.estimates_numbers:
-            of_numbers = jax.jacfwd(lambda d: model_step(self._informed(d), xi, u))(d)
+            of_numbers = jax.jacfwd(lambda d: model_step(self._informed(d, numbers), xi, u))(d)
             A = jnp.asarray(A).at[: len(xi), len(xi) :].add(of_numbers)
         W = jnp.asarray(self._covariance("process"), d.dtype)
         return Belief(after, matmul(A, matmul(P, A.T)) + W)

@@ -13,6 +13,7 @@ from jaxmpc.mpc.problem import MPC, at_stage
 from jaxmpc.pytrees import named_pytree, pytree
 from jaxmpc.qp.linalg import floating_dtype, matmul
 from jaxmpc.qp.status import Status
+from jaxmpc.robots.robot import RobotModel
 
 
 class Plant(Protocol):
@@ -65,9 +66,13 @@ class Feedback(Protocol):
         ...
 
 
-def model_of(controller: Feedback) -> Any:
-    """Return the model that a controller has of its plant: a Robot, the model of a
-    NonlinearController, a LinearPlant or LinearSystem."""
+def model_of(controller: Feedback, t: Any = 0) -> Any:
+    """Return the model that a controller has of its plant at step t of a loop: a Robot, the model
+    of a NonlinearController, a LinearPlant or LinearSystem."""
+    numbers_at = getattr(controller, "numbers_at", None)
+    if numbers_at is not None:  # other feet stand at other steps
+        robot: Any = getattr(controller, "robot", None)
+        return RobotModel(robot, numbers_at(t), exact=False)
     own = (getattr(controller, name, None) for name in ("robot", "plant", "model"))
     return next((model for model in own if model is not None), controller.mpc.system)
 

@@ -21,6 +21,7 @@ from jaxmpc.mpc.stagewise.solve import solve_stagewise
 from jaxmpc.pytrees import prepared_pytree, static
 from jaxmpc.qp.admm import ADMM, DEFAULT
 from jaxmpc.qp.linalg import arrays, floating_dtype
+from jaxmpc.robots.contacts import STANDING
 from jaxmpc.robots.force_limits import force_limits
 from jaxmpc.robots.gaits import Gait
 from jaxmpc.sets.convex_sets import Box
@@ -159,6 +160,21 @@ class GaitController:
             soft=(*as_tuple("soft", self.mpc.soft, Soft), friction),
             terminal_cost=last,
         )
+
+    def numbers_at(self, t: Any) -> dict[str, Any]:
+        """Return which feet stand at the control period t of the motion, as a number of the
+        robot's model."""
+        return {STANDING: jnp.asarray(self.gait.standing)[t % self.gait.period]}
+
+    def motion(self, t: Any) -> tuple[Any, Any]:
+        """Return what is tracked at the control period t where no other reference is given: ξ (n,)
+        and the torques of rest (m,)."""
+        return self.gait.reference(1, t)[0], self.gait.inputs
+
+    def begun(self, before: Control[Plan], t: int) -> Control[Plan]:
+        """Return what `start` gives for loops whose first plan begins at the control period t."""
+        memory: Any = before.memory
+        return before._replace(memory=memory._replace(time=jnp.int32(t)))
 
     def start(self, x: Array, input_reference: Any = None) -> Control[Plan]:
         """Return what stands for the time step before the first: the torques of rest."""

@@ -328,11 +328,11 @@ class Loop:
         elif noise is not None:
             seen = self.state(self.coordinates(x) + noise)
         if self.given.delay and observer is not None and belief is not None:
-            belief = observer.predicted(belief, previous, self.known(t))
+            belief = self.predicted(belief, previous, t)
             if self.later:
                 seen = self.state(observer.split(belief.mean)[0])
         elif self.later:
-            known, model = self.known(t), model_of(self.controller)
+            known, model = self.known(t), model_of(self.controller, t)
             after = model_step(model, self.coordinates(seen), previous)
             seen = self.state(after if known is None else after + known)
         return seen, estimate, belief
@@ -342,8 +342,19 @@ class Loop:
         forecast = self.given.forecast
         return forecast if forecast is None or forecast.ndim == 1 else forecast[t]
 
-    def stage_cost(self, x: Array, u: Array, r: Array | None, s: Array | None) -> Array:
-        """Return (x − r)'Q(x − r) + (u − s)'R(u − s), r and s the first rows of references."""
+    def predicted(self, belief: Belief, u: Array, t: Array) -> Belief:
+        """Return the observer's belief after step t, under the input u."""
+        assert self.observer is not None
+        numbers_at: Any = getattr(self.controller, "numbers_at", lambda t: {})
+        return self.observer.predicted(belief, u, self.known(t), numbers_at(t))
+
+    def stage_cost(self, x: Array, u: Array, t: Array) -> Array:
+        """Return (x − r)'Q(x − r) + (u − s)'R(u − s), r and s the references at step t, those of
+        the controller's own motion where none are given."""
+        r, s = self.references(t)
+        if hasattr(self.controller, "motion"):
+            own_r, own_s = self.controller.motion(t)
+            r, s = own_r if r is None else r, own_s if s is None else s
         error = _distance(self.controller.coordinates(x), r)
         effort = _distance(u, s)
         return jnp.sum(error * matmul(self.Q, error)) + jnp.sum(effort * matmul(self.R, effort))
@@ -379,7 +390,7 @@ class Loop:
             inputs=u,
             cost=plan.cost,
             status=plan.status,
-            stage_cost=self.stage_cost(x, u, *(self.references(t) if self.later else (r, s))),
+            stage_cost=self.stage_cost(x, u, t),
             violation=self.violation(x),
             slack=plan.slack[0],
             fallback=jnp.any(plan.slack > SLACK[x.dtype.name]),
@@ -397,7 +408,7 @@ class Loop:
         if process is not None:
             after = self.state(self.coordinates(after) + process)
         if observer is not None and belief is not None and not self.given.delay:
-            belief = observer.predicted(belief, u, self.known(t))
+            belief = self.predicted(belief, u, t)
         after = after if disturbance is None else after + disturbance
         return (after, control, control.u, belief), record
 
@@ -422,8 +433,11 @@ def _simulate(
 ) -> Run:
     loop, system = Loop(controller, plant, given, x0.dtype), controller.mpc.system
     observer, previous = loop.observer, given.previous_input
-    before = controller.start(x0, loop.rows(given.input_reference, loop.later, loop.horizon))
-    previous = before.u if previous is None else previous
+    aims = (loop.rows(given.input_reference, t, loop.horizon) for t in (loop.later, 0))
+    before, at_first = (controller.start(x0, aim) for aim in aims)
+    if loop.later and hasattr(controller, "begun"):
+        before = controller.begun(before, loop.later)
+    previous = at_first.u if previous is None else previous
     outputs = system.n if observer is None else observer.p
     w = v = belief = None
     if given.noise is not None:

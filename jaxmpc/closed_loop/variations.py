@@ -70,6 +70,7 @@ def draw_robots(
     1 − this to 1 + this; payload: masses in kg are from 0 to this. The dictionary has those that
     are not zero: "mass" (count, bodies), "damping" (count, nv), "payload" (count,).
     """
+    require_kind("robot", robot, Robot)
     whole("seed", seed, 0)
     starts = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0,)))
     home, below, above = start_room(robot)

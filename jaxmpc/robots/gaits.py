@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmpc.checks import fail, number, require_finite, require_shape
+from jaxmpc.checks import fail, number, require_finite, require_kind, require_shape
 from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.jax_transformations import compiled_lightly
 from jaxmpc.robots.contacts import STANDING, linear_cones
@@ -97,6 +97,7 @@ def gait(
 
     Raises ValueError for other robots and numbers, and where a foot cannot reach its step.
     """
+    require_kind("robot", robot, Robot)
     feet = tuple(feet)
     standing_robot = robot.standing(feet, friction=friction)
     model = robot.mujoco

@@ -7,7 +7,7 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.arrays import dimensions
-from jaxmpc.checks import fail
+from jaxmpc.checks import fail, require_shape
 from jaxmpc.mpc.steady_state import equilibrium
 from jaxmpc.pytrees import pytree, static
 from jaxmpc.sets.convex_sets import Box
@@ -110,4 +110,7 @@ class LinearPlant:
         strange = set(numbers) - {"A", "B", "c"}
         if strange:
             fail(sorted(strange)[0], "is no parameter of a linear plant", "Give A, B or c")
+        shapes = {"A": (self.n, self.n), "B": (self.n, self.m), "c": (self.n,)}
+        for name, value in numbers.items():
+            require_shape(name, value, shapes[name], "As in the plant's own system")
         return replace(self, system=replace(self.system, **numbers))

@@ -61,7 +61,15 @@ def _quotient(a: Any, b: Any, **_: Any) -> Degrees:
     return _product(a, Degrees(np.where(_degrees(b) <= 0, 0.0, np.inf)))
 
 
+def _converted(x: Degrees, new_dtype: Any, **_: Any) -> Degrees:
+    if np.issubdtype(new_dtype, np.floating):
+        return x
+    return Degrees(np.where(x.of <= 0, x.of, np.inf))
+
+
 def _power(x: Degrees, y: int, **_: Any) -> Degrees:
+    if y == 0:
+        return Degrees(np.zeros(x.shape))
     if y > 0:
         return Degrees(y * x.of)
     return Degrees(np.where(x.of <= 0, 0.0, np.inf))
@@ -92,7 +100,7 @@ def _same(x: Degrees, **_: Any) -> Degrees:
 
 _RULES: dict[str, Callable[..., Degrees]] = {
     **{"add": _sum, "add_any": _sum, "sub": _sum, "mul": _product, "div": _quotient},
-    **{"neg": _same, "convert_element_type": _same, "integer_pow": _power},
+    **{"neg": _same, "convert_element_type": _converted, "integer_pow": _power},
     **{"square": lambda x, **_: _product(x, x), "reduce_sum": _totalled},
     **{"dot_general": _contracted, "max": _larger},
     "min": lambda a, b, **_: _larger(a, b, -1.0),

@@ -190,10 +190,6 @@ def _aligned(values: Sequence[Taylor]) -> list[Taylor]:
     return [v.spread(axes).on(every) for v in values]
 
 
-def _same(x: Taylor, **_: Any) -> Taylor:
-    return x
-
-
 def _cosine(x: Taylor, **_: Any) -> Taylor:
     value, slope = cosine(x.of[0]), negative(sine(x.of[0]))
     return x.composed(value, slope, negative(value))
@@ -234,7 +230,15 @@ def _quotient(a: Taylor | np.ndarray, b: Taylor | np.ndarray, **_: Any) -> Taylo
     return Taylor(a.variables, multiply(a.of, inverse), a.steps)  # type: ignore[union-attr]
 
 
-def _power(x: Taylor, y: int, **_: Any) -> Taylor:
+def _converted(x: Taylor, new_dtype: Any, **_: Any) -> Taylor:
+    if not np.issubdtype(new_dtype, np.floating):
+        fail("robot", "its program rounds to whole numbers", "Take a smooth model")
+    return x
+
+
+def _power(x: Taylor, y: int, **_: Any) -> Any:
+    if y == 0:
+        return np.ones(x.shape)
     found = x
     for _step in range(abs(y) - 1):
         found = x * found if found is not x else x * x
@@ -266,7 +270,7 @@ def _contracted(
 RULES: dict[str, Callable[..., Taylor]] = {
     **{"add": _sum, "add_any": _sum, "sub": _difference, "mul": _product, "div": _quotient},
     **{"neg": lambda x, **_: -x, "square": lambda x, **_: x * x, "integer_pow": _power},
-    **{"cos": _cosine, "sin": _sine, "sqrt": _root, "convert_element_type": _same},
+    **{"cos": _cosine, "sin": _sine, "sqrt": _root, "convert_element_type": _converted},
     "rsqrt": lambda x, **_: _root(x).inverted(),
     **{"max": _larger, "min": lambda a, b, **_: _larger(a, b, -1.0)},
     "reduce_sum": lambda x, axes, **_: x.summed(axes),

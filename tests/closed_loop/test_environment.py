@@ -194,6 +194,14 @@ def test_gymnasium_accepts_it(environment):
     assert terminated and info["violation"] > 0
 
 
+def test_whole_numbers_are_states(environment, linear):
+    """A state of integers is that of floats: nothing is rounded to it."""
+    for one, x in ((environment, [0, 0]), (linear, np.array([1, 0]))):
+        states = [one.step(one.at(np.asarray(x, kind)), [0.3]) for kind in (int, float)]
+        for pair in zip(*map(jax.tree.leaves, states), strict=True):
+            np.testing.assert_allclose(*pair, atol=1e-7)
+
+
 def test_bad_environments_are_named(environment):
     robot = environment.robot
     state = environment.at(np.zeros(2))
@@ -208,6 +216,10 @@ def test_bad_environments_are_named(environment):
         (lambda: Environment.of(robot, spread=-1.0), "spread: -1.0. Give a fraction"),
         (lambda: Environment.of(robot, Q=[1.0, 1.0, 1.0], R=[1.0]), "Q: shape"),
         (lambda: Environment.of(robot, [1.0], Q=[1.0, 1.0], R=[1.0]), "target: needs torque"),
+        (lambda: Environment.of(robot, Q=[1.0, -5.0], R=[1.0]), "Q: .*not positive semidef"),
+        (lambda: Environment.of(robot, Q=[1.0, 5.0], R=[np.nan]), "R: holds NaN"),
+        (lambda: environment.at(np.zeros(3)), r"x: shape \(3,\) where"),
+        (lambda: environment.reset(0), "key: 0. Give a JAX key"),
         (lambda: environment.step(state, np.zeros(2)), r"action: shape \(2,\) where \(1,\)"),
         (lambda: policy(np.zeros(3)), r"observation: shape \(3,\) where"),
     ):

@@ -249,6 +249,19 @@ def test_a_delay_is_predicted_by_the_first_of_systems_that_differ():
 
 
 @pytest.mark.slow
+@pytest.mark.long
+def test_the_input_before_a_delayed_loop_is_the_first_reference():
+    """Plans begin with the second row; what acts until then is the first."""
+    mpc = jm.MPC(SYSTEM, np.eye(2), np.eye(1), 3)
+    controller = jm.RobotController(PLANT, mpc, linearize="trajectory")
+    s = np.linspace(0.1, 0.8, 8)[:, None]
+    for compensate in (True, False):
+        run = jm.simulate(
+            controller, PLANT, np.zeros(2), 4, input_reference=s[:6], delay=1, compensate=compensate
+        )
+        np.testing.assert_allclose(run.inputs[0], s[0])
+
+
 def test_a_robots_own_model_predicts_its_delay():
     """Inside its limits the predictor is the plant: the delayed loop of a robot far from where its
     law was made is the one without delay, a sample later. Without prediction it is another."""
@@ -419,6 +432,31 @@ def test_numbers_are_held_through_activations(loaded):
             fixed(np.array([1.0, 0.0]), numbers=numbers)
 
 
+HEAVY_LIGHT = """<mujoco><worldbody><body><joint name="a" axis="0 1 0" damping="5"/>
+<geom type="capsule" fromto="0 0 0 .5 0 0" size=".05" mass="30"/><site name="tool" pos=".5 0 0"/>
+<body pos=".5 0 0"><joint name="b" axis="0 1 0" damping=".01"/>
+<geom type="capsule" fromto="0 0 0 .1 0 0" size=".01" mass=".05"/></body></body></worldbody>
+<actuator><motor joint="a" ctrlrange="-900 900"/><motor joint="b" ctrlrange="-2 2"/></actuator>
+</mujoco>"""
+
+
+def test_loads_are_held_by_motors_of_any_size():
+    """The torque of a link of 30 kg beside one of 50 g, in float32: J'mg by MuJoCo's C engine."""
+    model = mujoco.MjModel.from_xml_string(HEAVY_LIGHT)
+    robot = jm.load_robot(model, control_period=0.01)
+    q = np.array([0.3, -0.2])
+    x, u = robot.set_point(q)
+    file, told = (RobotModel(robot, numbers, exact=False) for numbers in ({}, {"payload": 5.0}))
+    xi = np.asarray(robot.coordinates(x), np.float32)
+    held = held_references(file, told, xi, np.float32(u), np.float32)[1] - u
+    data, J = mujoco.MjData(model), np.zeros((3, 2))
+    data.qpos[:] = q
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    mujoco.mj_jacSite(model, data, J, None, model.site("tool").id)
+    np.testing.assert_allclose(held, J.T @ [0, 0, 5 * 9.81], rtol=1e-3, atol=1e-4)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("linearize", ["state", "trajectory", None])
 def test_plans_know_the_estimated_payload(loaded, linearize):
@@ -525,6 +563,7 @@ def test_bad_noise_and_observers_are_named():
         (lambda: run(noise=Noise(np.array([[1.0, 2.0], [2.0, 1.0]]))), "noise.process: is not pos"),
         (lambda: run(noise=Noise(np.nan)), "noise.process: holds NaN"),
         (lambda: run(noise=Noise(1.0, seed=0.5)), "noise.seed: 0.5. Give a whole number"),
+        (lambda: run(noise=Noise(1.0, seed=2**32)), "noise.seed: 4294967296. Give a whole number"),
         (lambda: run(noise=Noise(1.0, [1.0, 1.0]), observer=FILTER), "noise.measurement: shape"),
         (lambda: run(noise=0.1), "noise: is a float. Give a closed_loop.Noise"),
         (lambda: run(observer=SYSTEM), "observer: is a LinearSystem. Give a closed_loop.Kal"),

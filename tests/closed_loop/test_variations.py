@@ -91,6 +91,19 @@ def test_bad_ranges_are_named(arm):
         randomised(jm.LinearSystem([[1.0]], [[1.0]]), 3, mass=(0.9, 1.1))
 
 
+def test_matrices_of_other_shapes_are_named():
+    """A row where a matrix is needed would be another plant."""
+    system = jm.LinearSystem([[1.0, 0.1], [0, 1]], [[0.0], [0.1]], dt=0.1)
+    plant = jm.LinearPlant(system, jm.Box(-1.0, 1.0), jm.Box(-1.0, 1.0))
+    for name, value in (("A", [1.0, 2.0]), ("A", 1.0), ("B", np.ones((1, 2))), ("c", 0.5)):
+        with pytest.raises(ValueError, match=rf"{name}: shape .* where .* is needed"):
+            plant.vary(**{name: np.asarray(value)})
+    mpc = jm.MPC(system, np.eye(2), np.eye(1), 2)
+    law = jm.closed_loop.LinearFeedback(mpc, [[-1.0, -1.0]])
+    with pytest.raises(ValueError, match=r"A: shape \(2,\) where"):
+        jm.simulate_many(law, plant, np.ones((3, 2)), 2, variations={"A": np.ones((3, 2))})
+
+
 def test_factors_of_other_shapes_are_named(arm):
     with pytest.raises(ValueError, match=r"factors\['mass'\]: shape \(4,\). Give \(B, "):
         plant_numbers(arm, {"mass": np.ones(4)})

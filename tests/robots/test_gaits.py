@@ -197,12 +197,19 @@ def test_fixed_bases_have_no_gait():
 
 @pytest.mark.slow
 def test_inputs_may_act_a_sample_later(robot, gait):
-    """The model of the feet predicts the state for then, in float32 as in float64."""
-    controller = GaitController(gait, np.ones(36), np.full(12, 1e-3), horizon=10)
+    """The model of the feet that stand then predicts the state, and plans begin a phase later: the
+    delay costs nothing, and `stage_cost` is measured from the motion."""
+    Q = np.repeat([100.0, 200, 400, 200, 100, 20, 1, 0.5, 0.02], [1, 1, 1, 2, 1, 12, 3, 3, 12])
+    controller = GaitController(gait, Q, np.full(12, 1e-3), horizon=10)
     x, _ = gait.robot.equilibrium()
-    run = jm.simulate(controller, robot, x, steps=10, delay=1)
-    assert np.all(run.status == jm.Status.SOLVED)
-    assert np.all(np.abs(run.states[-1, :3] - x[:3]) < 0.06)
+    runs = [jm.simulate(controller, robot, x, steps=60, delay=delay) for delay in (0, 1)]
+    for run in runs:
+        assert np.all(run.status == jm.Status.SOLVED)
+        xi = np.array([robot.coordinates(one) for one in np.asarray(run.states[:-1])])
+        away, effort = xi - gait.reference(60), run.inputs - gait.inputs
+        cost = (away**2 * Q).sum(axis=1) + 1e-3 * (effort**2).sum(axis=1)
+        np.testing.assert_allclose(run.stage_cost, cost, rtol=1e-3, atol=1e-3)
+    assert np.mean(runs[1].stage_cost) < 1.2 * np.mean(runs[0].stage_cost)
 
 
 @pytest.mark.slow

@@ -91,7 +91,8 @@ def test_taylor_enclosures_hold_derivatives_on_boxes():
         A = jnp.stack([jnp.sin(x), x * x[::-1] + 3.0]) @ jnp.array([[1.0, -2.0], [0.5, 0.0]])
         norm = jnp.sqrt(jnp.sum(y**2) + 2.0)
         chosen = jnp.where(jnp.array([True, False]), x / norm, jnp.cos(y))
-        return A @ y, chosen.at[1].set(x[0] * y[1] - 1.0), jnp.maximum(norm, -jnp.inf) ** -3
+        chosen = chosen.at[1].set(x[0] * y[1] - 1.0) + jax.lax.integer_pow(x, 0)
+        return A @ y, chosen, jnp.maximum(norm, -jnp.inf) ** -3
 
     rng = np.random.default_rng(2)
     centre = rng.normal(size=(20, 4))
@@ -119,6 +120,9 @@ def test_programs_that_decide_are_refused():
     """An error names what has no bounds."""
     with pytest.raises(ValueError, match="the operation tanh"):
         TaylorProgram(jnp.tanh, (1,))(intervals.point([[0.5]]), np.array([[0.5]]))
+    with pytest.raises(ValueError, match="rounds to whole numbers"):
+        program = TaylorProgram(lambda x: x.astype(int) + x, (1,))
+        program(intervals.point([[0.5]]), np.array([[0.5]]))
     with pytest.raises(ValueError, match="the operation gt"):
         program = TaylorProgram(lambda x: jnp.where(x > 0, x, 2 * x), (1,))
         program(intervals.point([[0.5]]), np.array([[0.5]]))
@@ -133,12 +137,13 @@ def test_degrees_of_programs():
         chosen = jnp.where(q > 0, q, jnp.exp(q)) * v
         nothing = jnp.tanh(v[:1]), v[:1] / v[1:], jnp.where(v[:1] > 0, q[:1], q[1:])
         limited = jnp.clip(u, -jnp.inf, jnp.inf), jnp.clip(u, -1.0, 1.0)
+        whole = v.astype(int).astype(float), jax.lax.integer_pow(v, 0), q.astype(int).astype(float)
         exact = A @ mixed, chosen, v**3 * q, u * u - v[0], v[:1] * jnp.zeros(1), v / (q**2 + 1)
-        return jnp.concatenate(exact), jnp.concatenate([*nothing, *limited])
+        return jnp.concatenate(exact), jnp.concatenate([*nothing, *limited, *whole])
 
     exact, others = polynomial_degrees(program, (2, 2, 1), (0, 1, 2))
     np.testing.assert_array_equal(exact, [1, 2, 1, 1, 3, 3, 4, -np.inf, 1, 1])
-    np.testing.assert_array_equal(others, [np.inf, np.inf, np.inf, 2, np.inf])
+    np.testing.assert_array_equal(others, [*3 * [np.inf], 2, *3 * [np.inf], 0, 0, 0, 0])
 
 
 HALF = np.array([np.pi / 6, 2.0])
