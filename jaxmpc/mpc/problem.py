@@ -225,7 +225,8 @@ class MPC:
             x⁺ = A x + B u + c + E w, and all rows, the terminal set and soft rows too, are kept for
             every w_k ∈ W.
         disturbance_matrix: E (n, p); None: the identity.
-        policy: how later inputs answer to disturbances: "tightened", "affine" or "tube".
+        policy: how later inputs answer to disturbances: "tightened", "affine" or, to a Box or
+            Zonotope, "tube".
         gain: K (m, n) of the policies, u = Kx; None: the LQR gain of Q and R.
 
     Weights are symmetric; of one that is traced by JAX the symmetric part counts, in derivatives

@@ -170,6 +170,8 @@ def _bounds(
             if not np.isfinite(low[i]) or not np.isfinite(high[i]):
                 cure = f"Give {argument} that are bounded in every coordinate"
                 fail(argument, f"{name} has no bounds", cure)
+            if low[i] == high[i] and argument == "states":
+                fail(argument, f"{name} has no width", "Give it some: what moves leaves a point")
             if not low[i] <= at[i] <= high[i]:
                 problem = f"{name} in [{low[i]:g}, {high[i]:g}] leaves out the set-point {at[i]:g}"
                 fail(argument, problem, "Give a box around the set-point")

@@ -182,7 +182,7 @@ def sum_of_disturbances(
     W = W.to_zonotope() if isinstance(W, Box) else W
     if not isinstance(W, Zonotope):
         what = "is no Box or Zonotope, whose sums alone have generators"
-        fail("disturbance", what, "Give a Box or a Zonotope, or use the supports of the sum")
+        fail("disturbance", what, "Give a Box or a Zonotope, such as its bounding_box()")
     closed, E = np.asarray(closed, float), np.asarray(E, float)
     one = np.asarray(W.image(E).generators)
     if spread is not None:

@@ -240,6 +240,7 @@ def test_what_has_no_bounds_is_refused():
     plain = jm.load_robot(mujoco.MjModel.from_xml_string(make()))
     refused(plain, "has no bounds")
     refused(plain, "leaves out the set-point", states=jm.Box(np.ones(2), 2 * np.ones(2)))
+    refused(plain, "has no width", states=jm.Box(np.array([-1.0, 0]), np.array([1.0, 0])))
     refused(plain, "Give one of fitted, tangent", states=box, model="linear")
     refused(plain, "tolerance", states=box, tolerance=0.0)
 
