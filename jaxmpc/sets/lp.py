@@ -17,7 +17,6 @@ from typing import NamedTuple
 
 import highspy
 import numpy as np
-from scipy.sparse.csgraph import connected_components
 
 from jaxmpc.checks import fail
 
@@ -45,10 +44,16 @@ ROUNDING = 1e-11
 FAR = 1e3
 # Sides of rows that are smaller are zeros.
 UNDERFLOW = 1e-250
-# The logarithm of how much smaller a number may be than others of its kind, in the units that are
-# given, to count as a length or an entry: else it is the rounding of 0, as 0.1 + 0.2 − 0.3 is.
-GIVEN = 44
 _SWEEPS = 40  # of the least squares of `scaling`; fewer where they end before
+# Entries that scaling makes so small, and so much smaller beside the largest of their row than they
+# are as given, are doubtful: their column may have a unit that is rounding. Smaller ones than the
+# last of these are rounding themselves.
+_DOUBTFUL, _SHRUNK, _ENTRY = 2.0**-24, 2.0**-16, 2.0**-40
+# So are the units in which a row lets points go farther: to HiGHS 1e20 is no limit.
+_BEYOND = 2.0**50
+# A unit fits where points of the set lie within so many units, and not all far below.
+_FIT = 8.0
+_ROUNDS, _FACTOR = 8, 2.0**20  # of enlarging units, each by so much where there is no end
 
 
 class Optimum(NamedTuple):
@@ -64,14 +69,79 @@ class Program:
     """Programs over {x : G x <= g}, with equality in the rows of the mask `equal` (None: none).
 
     row (rows,), column (n,): powers of two with row_i G_ij column_j and row_i g_i of about 1. They
-    come from the data alone, and follow a change of units of any row or coordinate.
+    come from the data alone, and follow a change of units of any row or coordinate; but where a
+    side that is small beside others, such as 5.6e-17 in place of 0, would make the unit of its
+    coordinate so small that entries of other rows vanish, the extent of the set decides.
     """
 
     def __init__(self, G: np.ndarray, g: np.ndarray, equal: np.ndarray | None = None) -> None:
         self.G, self.g = np.asarray(G, np.float64), np.asarray(g, np.float64)
         self.equal = np.zeros(len(self.g), bool) if equal is None else equal
-        self.row, self.column = scaling(self.G, self.g)
-        self.M, self.b = self.row[:, None] * self.G * self.column, self.row * self.g
+        row, column = scaling(self.G, self.g)
+        self._scale(column, row)
+        self._fitted = np.zeros(len(column), bool)
+        self._fit_units()
+
+    def _scale(self, column: np.ndarray, row: np.ndarray | None = None) -> None:
+        """Take these units of the coordinates, and of the rows; None: their largest entries."""
+        if row is None:
+            row = 1 / power_of_two(np.abs(self.G * column).max(axis=1, initial=0.0))
+        self.row, self.column = row, column
+        self.M, self.b = row[:, None] * self.G * column, row * self.g
+        for name in ("_model", "violation", "farkas"):
+            self.__dict__.pop(name, None)
+
+    def _doubtful(self, d: np.ndarray | None = None) -> np.ndarray:
+        """Return of which coordinates (n,) entries of the rows, or of d, may have vanished, or
+        sides may be beyond all limits, by a unit that is far too small, but for those whose units
+        are known to fit."""
+        given = self.G if d is None else d[None]
+        size, whole = np.abs(given), self.row[:, None] if d is None else 1.0
+        scaled = whole * size * self.column
+        relative = lambda v: v / np.maximum(v.max(axis=1, keepdims=True, initial=0.0), 1e-300)
+        size, scaled = relative(size), relative(scaled)
+        doubtful = (scaled < np.minimum(_DOUBTFUL, _SHRUNK * size)) & (size > _ENTRY)
+        if d is None:
+            doubtful |= (self.b > _BEYOND)[:, None] & (scaled > _ENTRY)
+        return doubtful.any(axis=0) & ~self._fitted
+
+    def _fit_units(self, d: np.ndarray | None = None) -> None:
+        """Let units of doubtful coordinates grow until no point of the set lies far beyond them, or
+        no entry is doubtful where the set has no end. If other units do not fit then, and those as
+        given do, these are taken."""
+        columns = self._doubtful(d)
+        if not columns.any():
+            return
+        for _ in range(_ROUNDS):
+            far = self._extent(columns)
+            self._fitted |= columns & (far <= _FIT)
+            grown = np.where(far > _FIT, np.where(np.isfinite(far), far, _FACTOR), 1.0)
+            self._scale(self.column * power_of_two(grown))
+            columns = self._doubtful(d) | (columns & (far > _FIT) & np.isfinite(far))
+            if not columns.any():
+                break
+        before = self.row, self.column
+        if not self._fits():
+            self._scale(np.ones_like(self.column))
+            if not self._fits():
+                self._scale(*reversed(before))
+        self._fitted |= columns
+
+    def _fits(self) -> bool:
+        """Return whether the set lies neither far beyond the units nor far below."""
+        far = self._extent(np.ones(len(self.column), bool))
+        far = far[np.isfinite(far) & (far > 0)]
+        return bool(np.all((far < 1e6) & (far > 1e-6)))
+
+    def _extent(self, columns: np.ndarray) -> np.ndarray:
+        """Return how far points of the set lie from 0 along these coordinates (n,), in units; inf
+        where HiGHS finds no end, 0 for other coordinates."""
+        far = np.zeros(len(self.column))
+        for j in np.flatnonzero(columns):
+            for side in (1.0, -1.0):
+                found, _ = self._model.maximise(side * np.eye(len(far))[j])
+                far[j] = max(far[j], np.inf if found is None else abs(found[0][j]))
+        return far
 
     def maximise(self, d: np.ndarray) -> Optimum:
         """Maximise d'x: the simplex, then the interior point, then the dual program.
@@ -81,6 +151,7 @@ class Program:
         that there is none.
         """
         d = np.asarray(d, np.float64)
+        self._fit_units(d)
         cost = d * self.column
         length = np.abs(cost).max(initial=0.0) or 1.0
         cost = cost / length
@@ -348,7 +419,6 @@ def scaling(G: np.ndarray, g: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     with np.errstate(divide="ignore", invalid="ignore"):
         # What is added against underflow, as to bounds of proofs, is no distance.
         every, distance = np.log2(np.abs(G)), np.log2(np.where(np.abs(g) > UNDERFLOW, np.abs(g), 0))
-        distance = np.where(_rounding_sides(G, every, distance), -np.inf, distance)
         reach = np.where(np.isfinite(every), distance[:, None] - every, np.inf)
         reach[~np.isfinite(distance)] = np.inf
         L = np.where(_rounding_entries(every, distance, reach), -np.inf, every)
@@ -386,61 +456,21 @@ def scaling(G: np.ndarray, g: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.exp2(-np.round(top)), np.exp2(column)
 
 
-def _rounding_sides(G: np.ndarray, L: np.ndarray, distance: np.ndarray) -> np.ndarray:
-    """Return which sides g_i are rounding of 0; L and distance are the logarithms of [G, g].
-
-    They are `GIVEN` times smaller, beside the largest entry of their row, than other sides of rows
-    with the same coordinates, or coordinates that share a row with these; of a coordinate with one
-    bound and no other row, than other sides at all. A small set is no rounding: that in which a
-    coordinate has two such bounds of its own.
-    """
-    top = L.max(axis=1, initial=-np.inf)
-    size = np.where(np.isfinite(top), distance - top, -np.inf)
-    known = np.isfinite(size)
-    if not known.any() or size[known].min() >= size[known].max() - GIVEN:
-        return np.zeros(len(size), bool)
-    there = np.isfinite(L) & (L > top[:, None] - GIVEN)
-    _, part = connected_components(there.T.astype(np.int64) @ there)
-    own = np.where(there.any(axis=1), part[there.argmax(axis=1)], -1)
-    most = np.full(len(part) + 1, -np.inf)
-    np.maximum.at(most, own[known], size[known])
-    at, alone = there.argmax(axis=1), there.sum(axis=1) == 1
-    positive = G[np.arange(len(G)), at] > 0
-    for j in np.unique(at[alone]):
-        here = at == j
-        if np.all(there[:, j] == (alone & here)) and len(set(positive[alone & here])) == 1:
-            most[part[j]] = size[known].max()
-    small = known & (size < most[own] - GIVEN)
-    for j in np.unique(at[alone & small]):
-        here = alone & small & (at == j)
-        if len(set(positive[here])) == 2:
-            small &= ~here
-    return small
-
-
 def _rounding_entries(L: np.ndarray, distance: np.ndarray, reach: np.ndarray) -> np.ndarray:
     """Return which entries of G are rounding; L and distance are the logarithms of [G, g].
 
     They are 1e10 times smaller than the largest of their row where each x_j is in units of how far
     along it the nearest row lets a point go. Then either the entry or the distance of that row is
     rounding: that which is smaller beside the largest entry of its row. In many rows such entries
-    would pass for another unit of their column. Of a coordinate that no other distance is known of
-    those are rounding that are `GIVEN` times smaller in the units that are given, where other rows
-    have larger ones.
+    would pass for another unit of their column.
     """
-    top = L.max(axis=1, initial=-np.inf)
-    tiny = np.isfinite(L) & (L < top[:, None] - GIVEN)
-    if tiny.any():
-        large = np.isfinite(L) & ~tiny
-        tiny &= large.any(axis=0) & ~np.isfinite(np.where(large, reach, np.inf)).any(axis=0)
-        reach = np.where(tiny, np.inf, reach)
-    nearest = reach.min(axis=0, initial=np.inf)
+    nearest, top = reach.min(axis=0, initial=np.inf), L.max(axis=1, initial=-np.inf)
     known = np.isfinite(nearest)
     if not known.any():
-        return tiny
+        return np.zeros(L.shape, bool)
     scaled = np.where(known, L + nearest, -np.inf)
     small = scaled - scaled.max(axis=1, keepdims=True) < -33
-    return tiny | (known & small & (L - top[:, None] < (distance - top)[reach.argmin(axis=0)]))
+    return known & small & (L - top[:, None] < (distance - top)[reach.argmin(axis=0)])
 
 
 def maximise(d: np.ndarray, G: np.ndarray, g: np.ndarray) -> Optimum:

@@ -102,9 +102,10 @@ def test_a_set_is_unbounded_where_only_rounding_closes_it(spread):
     np.testing.assert_allclose([low[0], low[1], high[1]] * unit[[0, 1, 1]], [-1.25, -1, 1])
 
 
-@pytest.mark.parametrize("rounding", [0.1 + 0.2 - 0.3, 1e-25])
-def test_a_side_that_is_rounding_of_zero_is_no_length(rounding):
-    """Sets with a row through 0 are those with rounding in its place, in all that is asked."""
+@pytest.mark.parametrize("rounding", [0.1 + 0.2 - 0.3, 1e-25, 3e-12, 1e-10])
+def test_a_side_that_is_small_beside_others_is_no_unit(rounding):
+    """Sets with a row through 0 are those with rounding in its place, or another number far below
+    all others, in all that is asked."""
     random = np.random.default_rng(0)
     looked = 0
     while looked < 25:
@@ -122,10 +123,10 @@ def test_a_side_that_is_rounding_of_zero_is_no_length(rounding):
         found = jm.Polytope(H, h)
         d = random.integers(-2, 3, (3, n)) + 0.1
         assert found.is_bounded()
-        np.testing.assert_allclose(found.support(d), exact.support(d), atol=1e-9)
+        np.testing.assert_allclose(found.support(d), exact.support(d), atol=1e-9 + 20 * rounding)
         np.testing.assert_allclose(found.volume(), exact.volume(), rtol=1e-9)
         box = [end for P in (found, exact) for end in P.bounding_box().bounds()]
-        np.testing.assert_allclose(box[:2], box[2:], atol=1e-9)
+        np.testing.assert_allclose(box[:2], box[2:], atol=1e-9 + 20 * rounding)
         less = jm.Polytope(d, exact.support(d) - 0.01)
         assert not found <= less
 
@@ -143,6 +144,15 @@ def test_rounding_closes_nothing_and_opens_nothing():
     half = jm.Box([-np.inf, -0.7], [0.9, 1.9])
     total = half + jm.sets.Zonotope([-1.1, 2.1], [[-0.2], [0.5]])
     assert total.support([1.0, 2.0]) == pytest.approx(8.6)
+    # Units that are 1e18 apart are no rounding, nor is a limit of 1e20.
+    s = np.array([1e9, 1e-9])
+    corner = jm.Polytope(np.array([[-1, -2], [0, -1], [3, 1], [-1, 1]]) * s, [0, 0, 3, 1])
+    np.testing.assert_allclose([*corner.support(np.diag(s)), corner.volume()], [1, 1.5, 4 / 3])
+    assert (
+        jm.Polytope(np.array([[0, 3], [3, 0], [-2, -1]]) * s, np.zeros(3)).affine_dimension() == 0
+    )
+    loose = jm.Polytope([[1, 1], [-1, -1], [1, 0], [-1, 1]], [1, 1, 1e20, 1])
+    np.testing.assert_allclose(loose.support([[0, 1], [1, 1]]), [1, 1], atol=1e-9)
     # Two bounds of a coordinate's own are a small set.
     small = jm.Box([-1e-17, -1], [2e-17, 1])
     np.testing.assert_allclose(small.volume(), 6e-17, rtol=1e-9)
