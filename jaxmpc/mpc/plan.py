@@ -114,6 +114,8 @@ def constant_references(
     found = {}
     for name, value in given.items():
         if value is not None:
+            if sizes[name] == 1 and isinstance(value, int | float):
+                value = [value]
             cure = "Give one number each: where the loops stay"
             require_shape(name, value, (sizes[name],), cure)
             require_finite(name, value)

@@ -23,7 +23,6 @@ from jaxmpc.sets.lp import (
     extent,
     largest_margin,
     maximise,
-    scaling,
 )
 
 _ZERO = 1e-12  # a coefficient that moves a row by less, relative to its distance, counts as 0
@@ -208,7 +207,8 @@ def affine_hull(
     equal = implied_equalities(G, g, tolerance)
     if not equal.any():
         return AffineHull(np.zeros(n), np.eye(n), equal, np.arange(len(g)), G, g)
-    row, column = scaling(G, g)
+    program = Program(G, g)
+    row, column = program.row, program.column
     E, e = (row[:, None] * G * column)[equal], (row * g)[equal]
     U, size, Vt = np.linalg.svd(E[:, keep:], full_matrices=False)
     rank = int((size > 1e-10 * max(size.max(initial=0.0), 1e-300)).sum())

@@ -1031,8 +1031,9 @@ class Zonotope(LinearSet):
         if U.shape[1]:
             S = generators.merged(U.T @ (G / unit[:, None]))
             parts.append(generators.facet_normals(S) @ U.T)
-        d = np.vstack([*parts, N.T]) / unit
-        d = cleaned(d, np.abs(d).max(axis=1, keepdims=True, initial=0.0))
+        d = np.vstack([*parts, N.T])
+        # In units in which the set is about 1 wide: elsewhere small entries may be no rounding.
+        d = cleaned(d, np.abs(d).max(axis=1, keepdims=True, initial=0.0)) / unit
         d = d / np.linalg.norm(d, axis=1)[:, None]
         middle, half = d @ center, np.abs(d @ G).sum(axis=1)
         half[len(d) - N.shape[1] :] = 0.0

@@ -67,6 +67,7 @@ class Optimum(NamedTuple):
 
 class Program:
     """Programs over {x : G x <= g}, with equality in the rows of the mask `equal` (None: none).
+    along (n,): a direction that is to be maximised, None for any.
 
     row (rows,), column (n,): powers of two with row_i G_ij column_j and row_i g_i of about 1. They
     come from the data alone, and follow a change of units of any row or coordinate; but where a
@@ -74,13 +75,21 @@ class Program:
     coordinate so small that entries of other rows vanish, the extent of the set decides.
     """
 
-    def __init__(self, G: np.ndarray, g: np.ndarray, equal: np.ndarray | None = None) -> None:
+    def __init__(
+        self,
+        G: np.ndarray,
+        g: np.ndarray,
+        equal: np.ndarray | None = None,
+        along: np.ndarray | None = None,
+    ) -> None:
         self.G, self.g = np.asarray(G, np.float64), np.asarray(g, np.float64)
         self.equal = np.zeros(len(self.g), bool) if equal is None else equal
         row, column = scaling(self.G, self.g)
         self._scale(column, row)
         self._fitted = np.zeros(len(column), bool)
-        self._fit_units()
+        self._fit_units(None)
+        if along is not None:
+            self._fit_units(along)
 
     def _scale(self, column: np.ndarray, row: np.ndarray | None = None) -> None:
         """Take these units of the coordinates, and of the rows; None: their largest entries."""
@@ -91,7 +100,7 @@ class Program:
         for name in ("_model", "violation", "farkas"):
             self.__dict__.pop(name, None)
 
-    def _doubtful(self, d: np.ndarray | None = None) -> np.ndarray:
+    def _doubtful(self, d: np.ndarray | None) -> np.ndarray:
         """Return of which coordinates (n,) entries of the rows, or of d, may have vanished, or
         sides may be beyond all limits, by a unit that is far too small, but for those whose units
         are known to fit."""
@@ -105,10 +114,10 @@ class Program:
             doubtful |= (self.b > _BEYOND)[:, None] & (scaled > _ENTRY)
         return doubtful.any(axis=0) & ~self._fitted
 
-    def _fit_units(self, d: np.ndarray | None = None) -> None:
-        """Let units of doubtful coordinates grow until no point of the set lies far beyond them, or
-        no entry is doubtful where the set has no end. If other units do not fit then, and those as
-        given do, these are taken."""
+    def _fit_units(self, d: np.ndarray | None) -> None:
+        """Let units of doubtful coordinates, of the rows or of d, grow until no point of the set
+        lies far beyond them, or no entry is doubtful where the set has no end. If other units do
+        not fit then, and those as given do, these are taken."""
         columns = self._doubtful(d)
         if not columns.any():
             return
@@ -120,11 +129,11 @@ class Program:
             columns = self._doubtful(d) | (columns & (far > _FIT) & np.isfinite(far))
             if not columns.any():
                 break
-        before = self.row, self.column
+        grown_units = self.column, self.row
         if not self._fits():
             self._scale(np.ones_like(self.column))
             if not self._fits():
-                self._scale(*reversed(before))
+                self._scale(*grown_units)
         self._fitted |= columns
 
     def _fits(self) -> bool:
@@ -151,7 +160,8 @@ class Program:
         that there is none.
         """
         d = np.asarray(d, np.float64)
-        self._fit_units(d)
+        if self._doubtful(d).any():  # another program, for threads share this one
+            return Program(self.G, self.g, self.equal, d).maximise(d)
         cost = d * self.column
         length = np.abs(cost).max(initial=0.0) or 1.0
         cost = cost / length
@@ -209,6 +219,10 @@ class Program:
         scaled = self.row * values
         self.column[-1] = 1 / power_of_two(np.abs(scaled).max(initial=0.0))
         self.G[:, -1], self.M[:, -1] = values, scaled * self.column[-1]
+        if np.abs(self.M).max(axis=1, initial=0.0).min(initial=1.0) < _DOUBTFUL:
+            # The scale of some row was that of an entry that is no more there.
+            self.__init__(self.G, self.g, self.equal)  # type: ignore[misc]
+            return
         self._model.change_last_column(self.M[:, -1])
         for name in ("violation", "farkas"):
             self.__dict__.pop(name, None)

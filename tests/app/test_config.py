@@ -116,17 +116,16 @@ def test_rows_of_outputs_are_named_by_their_place_in_the_file(write):
             load(write(more=text)).build_mpc()
 
 
-def test_the_exact_penalty_is_that_of_the_limits_beside_soft_outputs(write):
-    """A soft row that never binds has no say in the weight of the limits; the target has."""
+def test_the_exact_penalty_of_a_file(write):
+    """It is that of the file's target; beside soft outputs no weight is known to be exact."""
     exact = ("R = [", 'rho = "exact"\nR = [')
     output = "\n[[outputs]]\nC = [[1.0, 1.0]]\nlower = [-50.0]\nupper = [50.0]\nrho = 5.0\n"
     target = "\n[reference]\nstate = [20.0, 0.0]\n"
-    problems = [
-        load(write(*exact, more=more)).build_controlled() for more in ("", target, target + output)
-    ]
+    problems = [load(write(*exact, more=more)).build_controlled() for more in ("", target)]
     weights = [np.max(np.asarray(one.soft[-1].rho)) for one in problems]
     assert weights[0] == 1 and weights[1] > 5
-    assert weights[2] == pytest.approx(weights[1], rel=1e-6)
+    with pytest.raises(ValueError, match=r'toml.*cost\.rho: "exact" beside soft outputs'):
+        load(write(*exact, more=output)).build_controlled()
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 import json
 import shlex
 from dataclasses import replace
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -171,6 +172,10 @@ def test_penalties_write_a_solver_that_is_read_back(tmp_path, monkeypatch, capsy
         return found
 
     monkeypatch.setattr(tune_solver, "tune_solver", learn)
+    Path("target.toml").write_text(problems.MINIMAL_FILE + "[reference]\nstate = [0.5, 0.0]\n")
+    assert run("solver --config target.toml --iterations 4 --count 16 --output aim") == 0
+    np.testing.assert_array_equal(asked["reference"], [0.5, 0.0])
+    capsys.readouterr()
     line = "solver --horizon 3 --iterations 6 --stages 2 --count 16 --updates 1"
     assert run(f"{line} --output out") == 0
     table = rows(capsys.readouterr().out)
@@ -364,3 +369,5 @@ def test_the_picture_has_residuals_of_the_default():
     own = replace(given, rho=float(jm.Controller(mpc, given).factor.rho[0, 0]))
     same = tune_solver.largest_residuals(mpc, states, (own, other))
     np.testing.assert_allclose(same, worst, rtol=1e-3, atol=1e-9)
+    aimed = tune_solver.largest_residuals(mpc, states, (own, other), reference=np.array([9.0, 0]))
+    assert np.abs(np.log(aimed / worst)).max() > 0.1

@@ -75,6 +75,7 @@ class TuneSolver(TuneSolverOptions):
                     validation=test,
                     checkpoint=checkpoint,
                     progress=sys.stderr.isatty(),
+                    **config.references(),
                     **given_options(
                         self, "iterations", "stages", "groups", "updates", "batch", "seed"
                     ),
@@ -82,7 +83,7 @@ class TuneSolver(TuneSolverOptions):
             )
         seconds = time.perf_counter() - learning
         given = dataclasses.replace(SOLVER, iterations=self.iterations)
-        worst = largest_residuals(mpc, test, (given, run.solver))
+        worst = largest_residuals(mpc, test, (given, run.solver), **config.references())
         infeasible = without_plan + round(run.after["infeasible"])
         save_run(self.output, config, run, options, worst, infeasible, seconds)
         rows = [
@@ -170,11 +171,13 @@ def penalties(run: TuningRun) -> tuple[np.ndarray, float]:
     return np.asarray(run.solver.rho, float), float(np.asarray(run.solver.alpha))
 
 
-def largest_residuals(mpc: MPC, states: np.ndarray, solvers: tuple[ADMM, ADMM]) -> np.ndarray:
+def largest_residuals(
+    mpc: MPC, states: np.ndarray, solvers: tuple[ADMM, ADMM], **references: Any
+) -> np.ndarray:
     """Return the largest residual (2, B) with each solver, of the states that neither proves
-    infeasible."""
+    infeasible. references: as in `solve`."""
     with jax.enable_x64(True):
-        each = jax.jit(lambda s: jax.vmap(lambda x: solve(mpc, x, solver=s))(states))
+        each = jax.jit(lambda s: jax.vmap(lambda x: solve(mpc, x, solver=s, **references))(states))
         plans = [jax.tree.map(np.asarray, each(solver)) for solver in solvers]
     worst = [np.max([p.primal_residual, p.dual_residual, np.abs(p.gap)], axis=0) for p in plans]
     feasible = np.all([p.status != Status.PRIMAL_INFEASIBLE for p in plans], axis=0)

@@ -21,7 +21,7 @@ from pydantic import (
 )
 from pydantic.dataclasses import dataclass
 
-from jaxmpc.checks import MOST_COUNT
+from jaxmpc.checks import MOST_COUNT, fail
 from jaxmpc.explicit.exact_penalties import exact_penalty
 from jaxmpc.grids import axis_indices, grid, grid_ends, mesh
 from jaxmpc.mpc.problem import MPC, Outputs, Soft, soften
@@ -435,9 +435,10 @@ class Config:
     @_in_keys
     def _softened(self, mpc: MPC, rho: Any) -> MPC:
         if isinstance(rho, str):
-            # Where some rows are soft already the penalty would be that of these alone.
-            whole = soften(mpc, 1.0) if mpc.soft else mpc
-            rho = exact_penalty(whole, **self.references()).advised
+            if mpc.soft:
+                what = '"exact" beside soft outputs, whose violation can push plans through limits'
+                fail("cost.rho", what, "Give a number, far larger than their rho")
+            rho = exact_penalty(mpc, **self.references()).advised
         return soften(mpc, rho)
 
     def build_solver(self) -> ADMM | None:
