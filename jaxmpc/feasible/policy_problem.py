@@ -44,6 +44,7 @@ from jaxmpc.mpc.tightening import feedback_gain, without_disturbance
 from jaxmpc.pytrees import record
 from jaxmpc.sets.convex_sets import Box
 from jaxmpc.sets.disturbances import disturbance_columns
+from jaxmpc.sets.generators import span
 from jaxmpc.sets.lp import Program, power_of_two
 from jaxmpc.systems.system import host_matrices
 
@@ -196,7 +197,7 @@ def directions(mpc: MPC) -> tuple[np.ndarray, np.ndarray]:
     without such a form."""
     require_generators(mpc.disturbance)
     center, gamma = generators(mpc.disturbance)
-    if gamma.size and np.linalg.matrix_rank(np.asarray(gamma, float)) < gamma.shape[1]:
+    if gamma.size and span(np.asarray(gamma, float))[1].shape[1] < gamma.shape[1]:
         what = "has generators that depend on each other, to which no policy can answer one by one"
         fail("disturbance", what, 'Give a Box or independent generators, or policy="tightened"')
     return center, gamma

@@ -286,6 +286,15 @@ def test_refusals(fields, message):
         jm.map_feasible_set(double(**fields), np.zeros((1, 2)))
 
 
+def test_a_tiny_side_of_a_disturbance_is_a_direction():
+    """That of a Box, in whatever units: generators are independent where their directions are."""
+    for W in (
+        jm.Box([-0.1, -1e-17], [0.1, 1e-17]),
+        jm.sets.Zonotope([0, 0], np.diag([0.1, 1e-17])),
+    ):
+        assert jm.map_feasible_set(double(disturbance=W), np.zeros((1, 2))).label[0] == 1
+
+
 def test_what_takes_one_sequence_refuses_affine_policies():
     mpc = double()
     for call in (

@@ -131,6 +131,30 @@ def test_a_side_that_is_small_beside_others_is_no_unit(rounding):
         assert not found <= less
 
 
+def test_another_last_column_brings_other_units():
+    """A row whose only entry was rounding does not keep the scale of that."""
+    G = np.array([[1, 1.0], [-1, 1], [0, 2e-17], [0, -2e-17], [1, 0], [-1, 0]])
+    program = Program(G.copy(), np.array([1, 1, 5, 5, 1, 1.0]))
+    program.maximise([0, 1.0])
+    program.change_last_column(np.array([1, 1, 0.7, -0.7, 0, 0]))
+    assert program.maximise([0, 1.0]).value == pytest.approx(1)
+
+
+def test_flat_sets_through_the_origin_keep_both_halves():
+    """Rows with rounding in their entries and sides of 0; a zonotope that is a needle."""
+    random = np.random.default_rng(0)
+    for _ in range(5):
+        H = np.vstack([np.eye(2), -np.eye(2)]) + 6e-17 * random.uniform(-1, 1, (4, 2))
+        flat = jm.Polytope(H, [0.1, 0, 0.1, 0])
+        found = flat.support(np.vstack([np.eye(2), -np.eye(2)]))
+        np.testing.assert_allclose(found, [0.1, 0, 0.1, 0], atol=1e-12)
+    for G in ([[1, 0.5], [5e-17, 2e-17]], [[1.0], [5e-17]]):
+        needle = jm.sets.Zonotope([0, 0], G).to_polytope()
+        half = np.abs(G).sum(axis=1)[0]
+        np.testing.assert_allclose(needle.support([[1.0, 0], [-1, 0]]), half)
+        assert not needle.contains([100.0, 0]) and needle.volume() < 1e-15
+
+
 def test_rounding_closes_nothing_and_opens_nothing():
     """A side on one side only; sums that leave some; entries beside facets through 0."""
     for e in (0.0, 1e-17):

@@ -91,6 +91,7 @@ from jaxmpc.qp.problem import Bounds
 from jaxmpc.qp.residuals import SHARE, Pair, Proof, Terms, with_status, worst
 from jaxmpc.qp.status import Status
 from jaxmpc.sets.convex_sets import Box, Zonotope
+from jaxmpc.sets.generators import span
 
 # Of the proximal term on the steps of columns, beside the largest weight of their rows.
 PROXIMAL = 1e-14
@@ -111,7 +112,7 @@ def require_independent_generators(W: Any) -> None:
         if not concrete(W.generators):
             fail("disturbance", "is a Zonotope inside a trace", cure)
         Gamma = host_array("disturbance", W.generators)
-        rank = int(np.linalg.matrix_rank(Gamma))
+        rank = span(Gamma)[1].shape[1]
         if rank < Gamma.shape[1]:
             what = (
                 f"has {Gamma.shape[1]} generators of rank {rank}: stage by stage each is answered"
