@@ -83,11 +83,28 @@ def equilibrium(
             set_.validate(name, size)
             low[part], high[part] = np.asarray(set_.lower, float), np.asarray(set_.upper, float)
     # In units in which all numbers are about 1: none of the user's decide what is an equilibrium.
-    every = np.vstack([M, np.eye(n + m), np.eye(n + m)])
-    row, column = scaling(every, np.concatenate([value, low, high]))
+    # An entry far below the others, rounding of 0 as in a computed target, may be no unit.
+    small = np.abs(value) < 1e-14 * np.abs(value).max(initial=0.0)
+    for sides in (value, np.where(small, 0.0, value)) if np.any(value[small]) else (value,):
+        found, error, held = _least_error(M, value, sides, low, high)
+        if held:
+            return found[:n], found[n:]
+    closest, drift = C @ found[:n], np.abs(error[:n]).max()
+    away = f"the closest has outputs {closest} and drifts by {drift:.3g} a step"
+    what = f"{target} is held by no equilibrium ({away})"
+    fail("target", what, "Choose another target or widen the limits")
+
+
+def _least_error(
+    M: np.ndarray, value: np.ndarray, sides: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, bool]:
+    """Return z within its bounds with the least error M z − value, of least effort, that error, and
+    whether it is rounding. sides: of the rows, from which the units follow."""
+    every = np.vstack([M, np.eye(len(low)), np.eye(len(low))])
+    row, column = scaling(every, np.concatenate([sides, low, high]))
     row = row[: len(M)]
-    rows, sides = row[:, None] * M * column, row * value
-    z, _, rank, _ = np.linalg.lstsq(rows, sides, rcond=1e-12)
+    rows, scaled = row[:, None] * M * column, row * value
+    z, _, rank, _ = np.linalg.lstsq(rows, scaled, rcond=1e-12)
     free = column[:, None] * np.linalg.svd(rows)[2][rank:].T
     found = column * z
     found = found - free @ np.linalg.lstsq(free, found, rcond=None)[0]
@@ -95,9 +112,9 @@ def equilibrium(
         open_, found = low < high, low.copy()
         if np.any(open_):
             # bvls: an active-set method, exact up to rounding.
-            sides = sides - rows[:, ~open_] @ (low / column)[~open_]
+            scaled = scaled - rows[:, ~open_] @ (low / column)[~open_]
             ends = (low / column)[open_], (high / column)[open_]
-            z = scipy.optimize.lsq_linear(rows[:, open_], sides, ends, method="bvls", tol=1e-15).x
+            z = scipy.optimize.lsq_linear(rows[:, open_], scaled, ends, method="bvls", tol=1e-15).x
             found[open_] = np.clip(column[open_] * z, low[open_], high[open_])
     for _ in range(2):  # where units are far apart, rounding of large entries moves small ones
         inside = (low < found) & (found < high)
@@ -108,13 +125,7 @@ def equilibrium(
     size = np.abs(M) @ np.abs(found) + np.abs(value)
     # Sums of zeros are off by rounding of the largest numbers.
     rounding = 1e-14 * np.max(np.append(np.abs(found) / column, np.abs(row * value))) / row
-    if not np.all(np.abs(error) <= rounding + 1e-9 * size):
-        closest = C @ found[:n]
-        drift = np.abs(error[:n]).max()
-        away = f"the closest has outputs {closest} and drifts by {drift:.3g} a step"
-        what = f"{target} is held by no equilibrium ({away})"
-        fail("target", what, "Choose another target or widen the limits")
-    return found[:n], found[n:]
+    return found, error, bool(np.all(np.abs(error) <= rounding + 1e-9 * size))
 
 
 @named_pytree

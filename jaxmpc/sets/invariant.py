@@ -294,6 +294,15 @@ def contraction(closed: np.ndarray, P: np.ndarray) -> float:
     return max(float(scipy.linalg.eigh(closed.T @ P @ closed, P, eigvals_only=True)[-1]), 0.0)
 
 
+def require_no_drift(system: LinearSystem) -> None:
+    """Raise ValueError for a system whose c is not zero."""
+    most = np.abs(host_array("c", 0 if system.c is None else system.c)).max()
+    if most > 0:
+        what = f"is not zero (an entry is {most:.3g}), so the origin is no equilibrium"
+        cure = "Write the system in deviations from its equilibrium; leave out a c that is rounding"
+        fail("system.c", what, cure)
+
+
 def _closed_loop(
     system: LinearSystem, K: Reals, states: Box | Polytope | None, inputs: Box | Polytope | None
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -303,9 +312,7 @@ def _closed_loop(
     require_shape("K", K, (m, n), "Give u = Kx one row an input, one column a state")
     K = host_array("K", K)
     require_finite("K", K)
-    if system.c is not None and np.any(host_array("c", system.c)):
-        cure = "Write the system in deviations from its equilibrium"
-        fail("system.c", "is not zero, so the origin is no equilibrium", cure)
+    require_no_drift(system)
     parts = [np.zeros((0, n))]
     for argument, limits, output in (("states", states, np.eye(n)), ("inputs", inputs, K)):
         if limits is None:

@@ -656,7 +656,10 @@ class Box(LinearSet):
         if empty.any():
             i = int(np.argmax(empty))
             cure = "Give lower <= upper, with -inf below or inf above for no bound"
-            fail(argument, f"is empty: lower[{i}] = {lower[i]:g}, upper[{i}] = {upper[i]:g}", cure)
+            ends = [f"{v:g}" for v in (lower[i], upper[i])]
+            if ends[0] == ends[1]:  # apart by rounding
+                ends = [repr(float(v)) for v in (lower[i], upper[i])]
+            fail(argument, f"is empty: lower[{i}] = {ends[0]}, upper[{i}] = {ends[1]}", cure)
 
     def is_empty(self) -> bool:
         """Return whether lower > upper in a coordinate."""

@@ -25,6 +25,7 @@ from jaxmpc.sets.disturbances import (
     with_vertices,
 )
 from jaxmpc.sets.fields import one_or_many
+from jaxmpc.sets.invariant import require_no_drift
 from jaxmpc.systems.riccati import require_stable
 from jaxmpc.systems.system import LinearSystem, host_matrices
 
@@ -130,11 +131,9 @@ def minimal_robust_invariant_set(
     """
     require_kind("system", system, LinearSystem)
     system.validate()
-    A, B, c = host_matrices(system)
+    require_no_drift(system)
+    A, B, _ = host_matrices(system)
     n, m = B.shape
-    if np.any(c):
-        cure = "Write the system in deviations from its equilibrium"
-        fail("system.c", "is not zero, so the origin is no equilibrium", cure)
     require_shape("K", K, (m, n), "Give u = Kx one row an input, one column a state")
     require_finite("K", K)
     if disturbance is None:

@@ -993,6 +993,17 @@ class TestSoften:
 
 
 class TestEquilibrium:
+    @pytest.mark.parametrize("rounding", [0.1 + 0.2 - 0.3, -1e-17])
+    def test_computed_targets_are_those_meant(self, rounding):
+        """Rounding in place of 0 in target or c; what is no rounding is refused as before."""
+        system = jm.LinearSystem([[1.0, 1], [0, 1]], [[0.5], [1]])
+        drifting = replace(system, c=np.array([rounding, -1e-17]))
+        for one, target in ((system, [1, rounding]), (drifting, [1.0, 0])):
+            x, u = equilibrium(one, target)
+            np.testing.assert_allclose([*x, *u], [1, 0, 0], atol=1e-15)
+        with pytest.raises(ValueError, match="held by no equilibrium"):
+            equilibrium(system, [1, 1e-9])
+
     def test_random_systems(self):
         """An answer where, and only where, an LP finds one; it holds still, inside the limits. In
         other units of each state, input and output too."""

@@ -166,6 +166,18 @@ def test_plan_is_that_of_solve():
     assert jax.tree.structure(plan) == jax.tree.structure(exact)
 
 
+@pytest.mark.long
+def test_rounding_of_weights_is_no_curvature():
+    """Weights of zero may be −1e-18, as in `solve`; what is curved downward is found in any
+    unit."""
+    mpc = problem()
+    n = mpc.system.n
+    for least, status in ((-1e-18, jm.Status.SOLVED), (-0.1, jm.Status.NON_CONVEX)):
+        Q = np.diag([1.0] + [least] * (n - 1))
+        plan = jax.jit(lambda Q: solve_stagewise(replace(mpc, Q=Q), np.zeros(n)))(Q)
+        assert plan.status == status
+
+
 @pytest.mark.slow
 def test_varying_system():
     """Optimal for the QP built by hand, to rounding after five Newton steps."""

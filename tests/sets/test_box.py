@@ -52,6 +52,7 @@ def test_sets_pass_under_jit_and_grad():
     ("box", "message"),
     [
         (Box([0, 0], [1, -1]), r"states: is empty: lower\[1\] = 0, upper\[1\] = -1"),
+        (Box([0.1 + 0.2, 0], [0.3, 1]), r"lower\[0\] = 0.30000000000000004, upper\[0\] = 0.3\."),
         (Box([INF, 0], [INF, 1]), "states: is empty"),
         (Box([-1, np.nan], [1, 1]), "states.lower: holds NaN"),
         (Box(jnp.array([-1.0, 0]), jnp.ones(1)), "states.upper: shape"),

@@ -244,7 +244,10 @@ def cleaned(s: Stages) -> tuple[Stages, Array]:
         )
     lower, upper = jnp.where(ordered, lower, -jnp.inf), jnp.where(ordered, upper, jnp.inf)
     Q, R, P, cross = finite((s.Q, s.R, s.P, s.cross))
-    sound = lambda M: jnp.all(jax.vmap(convex)(M)) if M.ndim == 3 else convex(M)
+    # What `require_symmetric_psd` takes for rounding of 0 is none of a curvature here either.
+    slack = lambda M: 1e-15 * jnp.max(jnp.abs(M), initial=0.0) * jnp.eye(len(M), dtype=M.dtype)
+    whole = lambda M: convex(M + slack(M))
+    sound = lambda M: jnp.all(jax.vmap(whole)(M)) if M.ndim == 3 else whole(M)
     convexity = [sound(Q), sound(R), sound(P)]
     fault = jnp.where(everywhere(*convexity), Status.NOT_RUN, Status.NON_CONVEX)
     fault = jnp.where(everywhere(*tests), fault, Status.NON_FINITE).astype(jnp.int32)
