@@ -109,6 +109,7 @@ def constant_references(
 ) -> References:
     """Return references (n,) and (m,) that hold at all time steps as arrays of float64, those that
     are given; ValueError that names argument, shape and cure for others."""
+    require_kind("mpc", mpc, MPC)
     sizes = {"reference": mpc.system.n, "input_reference": mpc.system.m}
     given = {"reference": reference, "input_reference": input_reference}
     found = {}

@@ -12,8 +12,9 @@ import pytest
 import scipy
 
 import jaxmpc as jm
-from jaxmpc.closed_loop import GaitController
+from jaxmpc.closed_loop import GaitController, KalmanFilter
 from jaxmpc.closed_loop.gait_controller import periodic_cost_to_go
+from jaxmpc.robots.contacts import STANDING
 
 QUADRUPED = Path(__file__).parents[2] / "experiments" / "robots" / "quadruped.xml"
 FEET = ("FL", "FR", "RL", "RR")
@@ -210,6 +211,23 @@ def test_inputs_may_act_a_sample_later(robot, gait):
         cost = (away**2 * Q).sum(axis=1) + 1e-3 * (effort**2).sum(axis=1)
         np.testing.assert_allclose(run.stage_cost, cost, rtol=1e-3, atol=1e-3)
     assert np.mean(runs[1].stage_cost) < 1.2 * np.mean(runs[0].stage_cost)
+
+
+@pytest.mark.slow
+def test_observers_know_which_feet_stand(gait):
+    """A filter predicts by the feet of the control period, as the gait's own linear model does."""
+    observer = KalmanFilter(gait.robot, 1e-3, 1e-3, C=np.eye(36), initial=1e-2).prepared()
+    xi, u = gait.states[5], gait.inputs
+    numbers = {STANDING: gait.standing[5]}
+    assert 0 < gait.standing[5].sum() < 4
+    with jax.enable_x64(True):
+        belief = observer.first(xi)
+        told, all_feet = (
+            np.asarray(observer.predicted(belief, u, None, given).mean) for given in (numbers, {})
+        )
+    A, B, c = (np.asarray(v)[5] for v in (gait.system.A, gait.system.B, gait.system.c))
+    np.testing.assert_allclose(told, A @ xi + B @ u + c, atol=1e-5)
+    assert np.abs(all_feet - told).max() > 0.1
 
 
 @pytest.mark.slow
