@@ -52,9 +52,10 @@ class Run:
     their coordinates. inputs (T, m): those that acted.
     cost (T,): the optimal value V_N(x_t) of each plan (without ½). status (T,): of each plan.
     stage_cost (T,): (x_t − r_t)'Q(x_t − r_t) + (u_t − s_t)'R(u_t − s_t) with
-    the references r, s, zero for none. violation (T+1,): the most by which x_t exceeds a row of
-    the state limits, in the units of the row; 0 where it keeps them all. slack (T, p): violations
-    of the soft rows at k = 0 of each plan, hence of what happens. fallback (T,): whether the plan
+    the references r, s, for none zero or the motion of a `GaitController`. violation (T+1,): the
+    most by which x_t exceeds a row of the state limits, in the units of the row; 0 where it keeps
+    them all. slack (T, p): violations of the soft rows at k = 0 of each plan, hence of what
+    happens. fallback (T,): whether the plan
     violates soft rows anywhere on its horizon by more than 1e-6 (1e-3 in float32), as happens
     where the limits cannot all be kept. estimates (T, n): the states as an observer estimates them
     from the outputs so far; None without an observer. disturbances (T, k): likewise, where it

@@ -51,6 +51,8 @@ _SWEEPS = 40  # of the least squares of `scaling`; fewer where they end before
 _DOUBTFUL, _SHRUNK, _ENTRY = 2.0**-24, 2.0**-16, 2.0**-40
 # So are the units in which a row lets points go farther: to HiGHS 1e20 is no limit.
 _BEYOND = 2.0**50
+# Sides that are given as large mean no limit.
+_NO_LIMIT = 1e15
 # A unit fits where points of the set lie within so many units, and not all far below.
 _FIT = 8.0
 _ROUNDS, _FACTOR = 8, 2.0**20  # of enlarging units, each by so much where there is no end
@@ -86,7 +88,7 @@ class Program:
         self.equal = np.zeros(len(self.g), bool) if equal is None else equal
         row, column = scaling(self.G, self.g)
         self._scale(column, row)
-        self._fitted = np.zeros(len(column), bool)
+        self._fitted, self.along = np.zeros(len(column), bool), along
         self._fit_units(None)
         if along is not None:
             self._fit_units(along)
@@ -100,40 +102,47 @@ class Program:
         for name in ("_model", "violation", "farkas"):
             self.__dict__.pop(name, None)
 
-    def _doubtful(self, d: np.ndarray | None) -> np.ndarray:
-        """Return of which coordinates (n,) entries of the rows, or of d, may have vanished, or
-        sides may be beyond all limits, by a unit that is far too small, but for those whose units
-        are known to fit."""
+    def _vanished(self, d: np.ndarray | None) -> np.ndarray:
+        """Return which entries of the rows (rows, n), or of d (1, n), may have vanished, or belong
+        to sides beyond all limits, by a unit that is far too small."""
         given = self.G if d is None else d[None]
         size, whole = np.abs(given), self.row[:, None] if d is None else 1.0
         scaled = whole * size * self.column
         relative = lambda v: v / np.maximum(v.max(axis=1, keepdims=True, initial=0.0), 1e-300)
         size, scaled = relative(size), relative(scaled)
-        doubtful = (scaled < np.minimum(_DOUBTFUL, _SHRUNK * size)) & (size > _ENTRY)
+        found = (scaled < np.minimum(_DOUBTFUL, _SHRUNK * size)) & (size > _ENTRY)
         if d is None:
-            doubtful |= (self.b > _BEYOND)[:, None] & (scaled > _ENTRY)
-        return doubtful.any(axis=0) & ~self._fitted
+            beyond = (self.b > _BEYOND) & (self.g < _NO_LIMIT)
+            found |= beyond[:, None] & (scaled > _ENTRY)
+        return found
 
     def _fit_units(self, d: np.ndarray | None) -> None:
         """Let units of doubtful coordinates, of the rows or of d, grow until no point of the set
-        lies far beyond them, or no entry is doubtful where the set has no end. If other units do
-        not fit then, and those as given do, these are taken."""
-        columns = self._doubtful(d)
+        lies far beyond them, or no entry is doubtful where the set has no end. If some do not fit
+        then, and those as given do, with entries of like size, these are taken; and the first ones,
+        unless fewer entries vanish than by these."""
+        doubtful = lambda: self._vanished(d).any(axis=0) & ~self._fitted
+        columns = doubtful()
         if not columns.any():
             return
+        first, lost = (self.column, self.row), self._vanished(d).sum()
         for _ in range(_ROUNDS):
             far = self._extent(columns)
             self._fitted |= columns & (far <= _FIT)
             grown = np.where(far > _FIT, np.where(np.isfinite(far), far, _FACTOR), 1.0)
             self._scale(self.column * power_of_two(grown))
-            columns = self._doubtful(d) | (columns & (far > _FIT) & np.isfinite(far))
+            columns = doubtful() | (columns & (far > _FIT) & np.isfinite(far))
             if not columns.any():
                 break
         grown_units = self.column, self.row
         if not self._fits():
             self._scale(np.ones_like(self.column))
-            if not self._fits():
+            size = np.abs(self.M)
+            alike = np.all((size > _DOUBTFUL) | (size < _ENTRY))
+            if not (alike and self._fits()):
                 self._scale(*grown_units)
+        if self._vanished(d).sum() >= lost:
+            self._scale(*first)
         self._fitted |= columns
 
     def _fits(self) -> bool:
@@ -160,8 +169,20 @@ class Program:
         that there is none.
         """
         d = np.asarray(d, np.float64)
-        if self._doubtful(d).any():  # another program, for threads share this one
-            return Program(self.G, self.g, self.equal, d).maximise(d)
+        best = self._maximise(d)
+        if self.along is None and best.y is not None and self._loses(d, best.y):
+            other = Program(self.G, self.g, self.equal, d)
+            if np.any(other.column != self.column):
+                return other.maximise(d)
+        return best
+
+    def _loses(self, d: np.ndarray, y: np.ndarray) -> bool:
+        """Return whether multipliers say nothing of an entry of d that may have vanished."""
+        left = np.abs(self.G.T @ y - d) > 1e-6 * (np.abs(self.G.T) @ np.abs(y) + np.abs(d))
+        return bool(left.any() and np.any(left & self._vanished(d)))
+
+    def _maximise(self, d: np.ndarray) -> Optimum:
+        """Return what `maximise` does, in the units that there are."""
         cost = d * self.column
         length = np.abs(cost).max(initial=0.0) or 1.0
         cost = cost / length
@@ -219,8 +240,8 @@ class Program:
         scaled = self.row * values
         self.column[-1] = 1 / power_of_two(np.abs(scaled).max(initial=0.0))
         self.G[:, -1], self.M[:, -1] = values, scaled * self.column[-1]
-        if np.abs(self.M).max(axis=1, initial=0.0).min(initial=1.0) < _DOUBTFUL:
-            # The scale of some row was that of an entry that is no more there.
+        if self._vanished(None).any():
+            # By the scale of a row whose only entry was rounding, and is no more there.
             self.__init__(self.G, self.g, self.equal)  # type: ignore[misc]
             return
         self._model.change_last_column(self.M[:, -1])

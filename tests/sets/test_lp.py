@@ -177,6 +177,13 @@ def test_rounding_closes_nothing_and_opens_nothing():
     )
     loose = jm.Polytope([[1, 1], [-1, -1], [1, 0], [-1, 1]], [1, 1, 1e20, 1])
     np.testing.assert_allclose(loose.support([[0, 1], [1, 1]]), [1, 1], atol=1e-9)
+    for far in (1e15, 1e18):
+        half = jm.Polytope([[1, 0], [-1, 0], [0, 1], [0, -1], [-1, -1]], [far, 0, 1, 1, -0.5])
+        np.testing.assert_allclose(half.support([[-1, 0], [-1, 0.5]]), [0, 0.5], atol=1e-9)
+    # The direction of a small entry has no say in units that fit.
+    s = 2.0 ** np.array([40, 20])
+    triangle = Program(np.array([[1, -2], [-1, 1], [1, 0.0]]) * s, np.array([-1.35e-12, 2, 0]))
+    assert triangle.maximise(np.array([-1e-9, -0.5]) * s).value == pytest.approx(1)
     # Two bounds of a coordinate's own are a small set.
     small = jm.Box([-1e-17, -1], [2e-17, 1])
     np.testing.assert_allclose(small.volume(), 6e-17, rtol=1e-9)
