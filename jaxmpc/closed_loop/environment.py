@@ -8,15 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxmpc.arrays import Reals, as_weight
-from jaxmpc.checks import (
-    fail,
-    number,
-    require_finite,
-    require_kind,
-    require_shape,
-    require_symmetric_psd,
-    whole,
-)
+from jaxmpc.checks import fail, number, require_kind, require_shape, require_symmetric_psd, whole
 from jaxmpc.closed_loop.feedback import Feedback, model_of
 from jaxmpc.closed_loop.robot_controller import robot_mpc
 from jaxmpc.closed_loop.variations import free_motions, start_room
@@ -111,7 +103,6 @@ class Environment:
         Q, R = as_weight(Q, robot.n), as_weight(R, robot.m)
         for name, weight, size in (("Q", Q, robot.n), ("R", R, robot.m)):
             require_shape(name, weight, (size, size), "Give a matrix, or its diagonal")
-            require_finite(name, weight)
             require_symmetric_psd(name, weight)
         x, u = robot.set_point(target)
         home, below, above = start_room(robot)

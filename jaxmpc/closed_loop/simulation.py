@@ -434,11 +434,12 @@ def _simulate(
 ) -> Run:
     loop, system = Loop(controller, plant, given, x0.dtype), controller.mpc.system
     observer, previous = loop.observer, given.previous_input
-    aims = (loop.rows(given.input_reference, t, loop.horizon) for t in (loop.later, 0))
-    before, at_first = (controller.start(x0, aim) for aim in aims)
+    start = lambda t: controller.start(x0, loop.rows(given.input_reference, t, loop.horizon))
+    before = start(loop.later)
+    if previous is None:  # a start traces the whole controller
+        previous = (start(0) if loop.later else before).u
     if loop.later and hasattr(controller, "begun"):
         before = controller.begun(before, loop.later)
-    previous = at_first.u if previous is None else previous
     outputs = system.n if observer is None else observer.p
     w = v = belief = None
     if given.noise is not None:
