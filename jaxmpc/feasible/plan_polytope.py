@@ -17,6 +17,7 @@ import scipy
 from jaxmpc.checks import fail
 from jaxmpc.mpc.condense import Inequalities, row_lengths
 from jaxmpc.pytrees import record
+from jaxmpc.sets import lp
 from jaxmpc.sets.convex_sets import Polytope
 from jaxmpc.sets.geometry import Empty, Flat, affine_hull, framed
 from jaxmpc.sets.lp import ROUNDING, Program, bound, extent, maximise, power_of_two
@@ -131,12 +132,12 @@ class PlanPolytope:
         t = np.concatenate([c.phi[1], c.psi[0]])
         return cls(np.hstack([rows.D, rows.C]), rows.b, M[:p], t[:p], not c.balls).reduced()
 
-    def reduced(self) -> "PlanPolytope":
+    def reduced(self, tolerance: float = lp.FLAT) -> "PlanPolytope":
         """Return the polytope in coordinates (θ, w) in which it has volume, v = shift + basis (θ,
-        w)."""
+        w). Rows that leave less room than `tolerance` are equalities."""
         if self.program.empty:
             return self
-        hull = affine_hull(self.G, self.g, keep=self.p)
+        hull = affine_hull(self.G, self.g, keep=self.p, tolerance=tolerance)
         if hull is None:
             return replace(self, flat=True)
         if not hull.equal.any():
@@ -187,10 +188,13 @@ class PlanPolytope:
         top = self.program.maximise(d)
         return top.value + shift, self.program.bound(d, top, self.extent) + shift, top.x
 
-    def support(self, direction: np.ndarray) -> float:
-        """Return an upper bound of direction'θ over the polytope, as in `largest_next`."""
+    def support(self, direction: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return an upper bound of direction'θ over the bounded polytope, as in `largest_next`, and
+        where it is attained, (p,)."""
         d = np.append(direction, np.zeros(self.G.shape[1] - self.p))
-        return self.program.bound(d, self.program.maximise(d), self.extent)
+        top = self.program.maximise(d)
+        assert top.x is not None
+        return self.program.bound(d, top, self.extent), top.x[: self.p]
 
     def center(self) -> np.ndarray:
         """Return the θ of a point well inside. Raises ValueError where there is none, because the
@@ -235,7 +239,8 @@ def projected(plans: PlanPolytope, deadline: float = np.inf) -> CenteredPolytope
     except Empty:
         return EMPTY
     except Flat:
-        return FLAT
+        thinner = plans.reduced(10 * lp.FLAT)
+        return FLAT if thinner is plans else projected(thinner, deadline)
     except ValueError as error:
         return f"its facets are too ill-conditioned ({error})"
     extent = plans.extent
@@ -243,12 +248,15 @@ def projected(plans: PlanPolytope, deadline: float = np.inf) -> CenteredPolytope
         return "the feasible set is unbounded"
     unit = power_of_two(extent)
     plans, state = plans.in_units(unit), unit[: plans.p]
-    center = center / state
     p = plans.p
     directions = normals = np.concatenate([np.eye(p), -np.eye(p)])
-    offsets, reached = np.array([plans.support(d) for d in normals]), np.zeros((0, p))
+    bounds, attained = zip(*(plans.support(d) for d in normals), strict=True)
+    # The first centre may lie on a facet where decisions have little room, and rays from there
+    # would be parallel to it; the mean of points on all sides of the set does not.
+    center = np.mean([center / state, *attained], axis=0)
+    offsets, reached = np.array(bounds), np.zeros((0, p))
     many = "its facets are too many to enumerate in the time given"
-    missed = np.zeros((0, p))
+    missed, ends = np.zeros((0, p)), []
     while len(offsets) < FACETS:
         last, short = missed, []
         for direction in directions:
@@ -256,8 +264,10 @@ def projected(plans: PlanPolytope, deadline: float = np.inf) -> CenteredPolytope
                 return many
             s, normal, offset = plans.ray(center, direction)
             short.append(s < 1 - TOLERANCE)
+            ends.append(center + s * direction)
             normals, offsets = np.vstack([normals, normal]), np.append(offsets, offset)
         reached = np.vstack([reached, (center + directions)[~np.array(short)]])
+        center = np.mean(ends, axis=0)
         try:
             # In these units bounds that are rounding are of limits at zero.
             offsets = np.where(np.abs(offsets) <= ROUNDING, 0.0, offsets)
