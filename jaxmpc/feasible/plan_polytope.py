@@ -188,13 +188,13 @@ class PlanPolytope:
         top = self.program.maximise(d)
         return top.value + shift, self.program.bound(d, top, self.extent) + shift, top.x
 
-    def support(self, direction: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return an upper bound of direction'θ over the bounded polytope, as in `largest_next`, and
-        where it is attained, (p,)."""
+    def support(self, direction: np.ndarray) -> tuple[float, np.ndarray | None]:
+        """Return an upper bound of direction'θ over the polytope, as in `largest_next`, and where
+        it is attained, (p,)."""
         d = np.append(direction, np.zeros(self.G.shape[1] - self.p))
         top = self.program.maximise(d)
-        assert top.x is not None
-        return self.program.bound(d, top, self.extent), top.x[: self.p]
+        at = None if top.x is None else top.x[: self.p]
+        return self.program.bound(d, top, self.extent), at
 
     def center(self) -> np.ndarray:
         """Return the θ of a point well inside. Raises ValueError where there is none, because the
@@ -253,7 +253,7 @@ def projected(plans: PlanPolytope, deadline: float = np.inf) -> CenteredPolytope
     bounds, attained = zip(*(plans.support(d) for d in normals), strict=True)
     # The first centre may lie on a facet where decisions have little room, and rays from there
     # would be parallel to it; the mean of points on all sides of the set does not.
-    center = np.mean([center / state, *attained], axis=0)
+    center = np.mean([center / state, *(x for x in attained if x is not None)], axis=0)
     offsets, reached = np.array(bounds), np.zeros((0, p))
     many = "its facets are too many to enumerate in the time given"
     missed, ends = np.zeros((0, p)), []

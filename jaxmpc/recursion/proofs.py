@@ -159,7 +159,7 @@ def _set_before(mpc: MPC, body: CenteredPolytope) -> str:
     if mpc.horizon < 2 or not is_standard_form(mpc) or mpc.disturbance is not None:
         return ""
     shorter = FeasibilityProblem.of(replace(mpc, horizon=mpc.horizon - 1)).plan_polytope
-    ends = [shorter.support(normal) for normal in body.normals]
+    ends = [shorter.support(normal)[0] for normal in body.normals]
     if np.any(np.array(ends) > body.offsets + TOLERANCE * body.depths):
         return ""
     N = mpc.horizon
