@@ -21,7 +21,7 @@ from jaxmpc.mpc.tightening import feedback_gain, require_tightened, without_dist
 from jaxmpc.pytrees import record
 from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope, set_bounds
 from jaxmpc.sets.disturbances import disturbance_columns, with_vertices
-from jaxmpc.sets.geometry import binding_rows, implied_equalities, unit_rows
+from jaxmpc.sets.geometry import ROUNDED, binding_rows, implied_equalities, unit_rows
 from jaxmpc.sets.lp import ROUNDING
 from jaxmpc.sets.polyhedra import independent
 
@@ -53,7 +53,9 @@ class FeasibilityProblem:
         require_tightened(mpc, "what labels by one sequence of inputs")
         mpc = with_constant_sets(mpc)
         boxes = {name: as_box(getattr(mpc, name)) for name in ("states", "inputs", "terminal_set")}
-        hard = with_equalities(replace(mpc, soft=(), input_rate_weight=None, **boxes))
+        outputs = tuple(map(_joined, as_tuple("outputs", mpc.outputs, Outputs)))
+        changes = {**boxes, "outputs": outputs, "soft": (), "input_rate_weight": None}
+        hard = with_equalities(replace(mpc, **changes))
         return cls(hard, make_view(hard, axes, fixed))
 
     @property
@@ -266,8 +268,11 @@ def with_equalities(mpc: MPC) -> MPC:
 
 def as_box(set_: Any) -> Any:
     """Return a Polytope whose rows are limits of single coordinates as the same Box, other sets as
-    they are. Two opposite rows become one equality then, and limits of inputs part of the proofs'
-    support functions. Rows must be powers of two long, so that nothing is rounded."""
+    they are. Two opposite rows become one equality then, also where they are that but for rounding,
+    and limits of inputs part of the proofs' support functions. Rows must be powers of two long, so
+    that nothing is rounded."""
+    if isinstance(set_, Box):
+        return _joined(set_)
     if not isinstance(set_, Polytope):
         return set_
     H, h = np.asarray(set_.H, np.float64), np.asarray(set_.h, np.float64)
@@ -278,4 +283,15 @@ def as_box(set_: Any) -> Any:
         limit = np.where(H != 0, (h / entry)[:, None], np.nan)
     upper = np.nanmin(np.where(H > 0, limit, np.inf), axis=0, initial=np.inf)
     lower = np.nanmax(np.where(H < 0, limit, -np.inf), axis=0, initial=-np.inf)
-    return Box(lower, upper) if np.all(lower <= upper) else set_
+    return _joined(Box(lower, upper)) if np.all(lower <= upper) else set_
+
+
+def _joined(limits: Any) -> Any:
+    """Return a Box or Outputs with both limits the lower one where they are equal but for rounding,
+    as 0.3 and 0.1 + 0.2 are: whoever keeps that one keeps both."""
+    lower, upper = (np.asarray(v, np.float64) for v in (limits.lower, limits.upper))
+    with np.errstate(invalid="ignore"):
+        apart = upper - lower
+        size = np.maximum(np.abs(lower), np.abs(upper))
+    equal = (apart > 0) & (apart <= ROUNDED * size) & np.isfinite(size)
+    return replace(limits, upper=np.where(equal, lower, upper)) if equal.any() else limits

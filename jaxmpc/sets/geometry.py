@@ -33,7 +33,7 @@ _MERGE = "C-1e-12"  # qhull's option: merge facets of the dual that are flat to 
 _HULL_DIMENSIONS = 6  # above, hulls have too many facets and one LP a row is faster
 _MOST_ROWS = 100_000  # an elimination step with more candidate rows raises ValueError
 _DOUBTFUL = 1e-5  # a smaller margin is looked at again, in other units
-_ROUNDED = 4 * np.finfo(float).eps  # slacks up to this, of the terms of their row, are rounding
+ROUNDED = 4 * np.finfo(float).eps  # slacks up to this, of the terms of their row, are rounding
 
 
 class Flat(ValueError):
@@ -116,18 +116,18 @@ def framed(argument: str, G: np.ndarray, g: np.ndarray) -> Frame:
 
     norms = np.linalg.norm(G, axis=1)
     slack, least = slack_at(center)
-    if least <= _ROUNDED:  # a scaled row, whose margin is this in its own units
+    if least <= ROUNDED:  # a scaled row, whose margin is this in its own units
         inside, _ = largest_margin(G, g, norms, 1.0)
         center = center if inside is None else inside
         slack, least = slack_at(center)
-        if least <= _ROUNDED:
+        if least <= ROUNDED:
             flat(0.0)
     step, margin, _ = Program(G, slack).margin()
     moved, left = slack_at(center + step)
     depth = moved[norms > 0] / norms[norms > 0]
     # Of rows x <= 1 and -x <= 1e-16 both scales take a point at the second for inside.
     uneven = len(depth) and depth.min() < 1e-9 * depth.max()
-    doubtful = uneven or margin <= _DOUBTFUL or left <= _ROUNDED
+    doubtful = uneven or margin <= _DOUBTFUL or left <= ROUNDED
     if left > least or not doubtful:
         center, slack = center + step, moved
     if doubtful:
@@ -146,7 +146,7 @@ def framed(argument: str, G: np.ndarray, g: np.ndarray) -> Frame:
             flat(margin)
         center = center + step
         slack, least = slack_at(center)
-        if least <= _ROUNDED:
+        if least <= ROUNDED:
             flat(0.0)
     return Frame.about(center, G, slack)
 

@@ -76,3 +76,34 @@ def test_a_flat_terminal_set_of_many_states_is_no_flat_feasible_set():
     assert np.all(jm.solve_many(mpc, around).solved)  # a body about the origin
     with pytest.raises(ValueError, match="facets are not found"):
         feasible_growth(mpc, [6])
+
+
+def limited(place, low, high):
+    """Return the problem with one coordinate, or all of the last state, between low and high."""
+    sides, n = np.array([[low, high], [-1.0, 1.0]]), np.eye(2)
+    ends = np.array([high, high, -low, -low])
+    given = {
+        "inputs": {"inputs": jm.Box(low, high)},
+        "states": {"states": jm.Box(*sides[::-1].T)},
+        "states of a polytope": {"states": jm.Polytope(np.vstack([n, -n]), [1, high, 1, -low])},
+        "end": {"terminal_set": jm.Box([low, low], [high, high])},
+        "end in a polytope": {"terminal_set": jm.Polytope(np.vstack([n, -n]), ends)},
+        "outputs": {"outputs": jm.Outputs([[1.0, 1.0]], [low], [high], stages=(3,))},
+    }
+    return replace(MPC, horizon=4, **given[place])
+
+
+@pytest.mark.parametrize(
+    "place", ["inputs", "states", "states of a polytope", "end", "end in a polytope", "outputs"]
+)
+def test_limits_that_are_equal_but_for_rounding_are_equal(place):
+    """0.1 + 0.2 is 0.3 and 5.6e-17. A state of one problem is labelled as that of the other one,
+    and none is left undecided."""
+    states = np.random.default_rng(1).uniform(-0.9, 0.9, (60, 2))
+    if place.startswith("states"):
+        states[:40, 1] = 0.3
+    exact, rounded = (
+        jm.map_feasible_set(limited(place, 0.3, high), states).label for high in (0.3, 0.1 + 0.2)
+    )
+    assert set(exact) == {1, -1}
+    np.testing.assert_array_equal(rounded, exact)
