@@ -20,7 +20,7 @@ from jaxmpc.pytrees import record
 from jaxmpc.sets import lp
 from jaxmpc.sets.convex_sets import Polytope
 from jaxmpc.sets.geometry import Empty, Flat, affine_hull, framed
-from jaxmpc.sets.lp import ROUNDING, Program, bound, extent, maximise, power_of_two
+from jaxmpc.sets.lp import Program, bound, extent, maximise, power_of_two
 
 # Reasons why a set has no facets: it has no volume.
 EMPTY, FLAT = "the feasible set is empty", "the feasible set is flat: it has no volume"
@@ -269,8 +269,6 @@ def projected(plans: PlanPolytope, deadline: float = np.inf) -> CenteredPolytope
         reached = np.vstack([reached, (center + directions)[~np.array(short)]])
         center = np.mean(ends, axis=0)
         try:
-            # In these units bounds that are rounding are of limits at zero.
-            offsets = np.where(np.abs(offsets) <= ROUNDING, 0.0, offsets)
             outer = Polytope(normals, offsets).require_body().reduce()
             vertices = outer.vertices()
         except ValueError as error:
