@@ -58,12 +58,10 @@ static void project(const real *t, const real *l, const real *u, const real *pen
   for (int i = 0; i < M; i++) {
     real v = t[i], p = v < l[i] ? l[i] : v > u[i] ? u[i] : v;
 #if NAME_SOFT
-    if (isfinite(soft_linear[i])) {
-      real distance = FABS(v - p), over = distance - soft_linear[i] / penalty[i];
-      if (over > 0) {
-        real slack = penalty[i] / (penalty[i] + soft_quadratic[i]) * over;
-        p += v > p ? slack : -slack;
-      }
+    real distance = FABS(v - p);
+    if (distance > soft_linear[i] / penalty[i]) { /* p is outside too: from v, which may be far */
+      real paid = soft_linear[i] + soft_quadratic[i] * distance;
+      p = v + (v > p ? -paid : paid) / (penalty[i] + soft_quadratic[i]);
     }
 #else
     (void)penalty;

@@ -94,7 +94,10 @@ class Bounds:
         """Return e = v − prox(v) (m,) with penalty rho, a number or (m,)."""
         s = self.outside(v)
         if self.linear is not None:
-            s = s - sign(s) * self._soft_violation(s, rho)
+            # v less how far prox(v) stays outside; that difference is lost where v is far.
+            beyond = self._stays_outside(s, rho)
+            weight = jnp.where(beyond, self.linear, 0.0) + self.quadratic * jnp.abs(s)
+            s = jnp.where(beyond, sign(s) * weight / (rho + self.quadratic), s)
         for rows, radius in self.blocks():
             s = s.at[rows].multiply(1 - self._shrinking(s[rows], radius))
         return s
@@ -158,7 +161,7 @@ class Bounds:
         s = self.outside(v)
         weights = (s != 0).astype(v.dtype)
         if self.linear is not None:
-            beyond = self._soft_violation(s, rho) > 0
+            beyond = self._stays_outside(s, rho)
             weights = jnp.where(beyond, self.quadratic / (rho + self.quadratic), weights)
         normals = []
         for rows, radius in self.blocks():
@@ -181,7 +184,7 @@ class Bounds:
             return sign(s)
         count = jnp.ones_like(s)
         if self.linear is not None:
-            count = count + (self._soft_violation(s, rho) > 0)
+            count = count + self._stays_outside(s, rho)
         piece = sign(s) * count
         for rows, radius in self.blocks():
             piece = piece.at[rows].set((self._length(s[rows]) > radius).astype(v.dtype))
@@ -263,12 +266,10 @@ class Bounds:
         l, u = self.l + jnp.minimum(e, 0.0), self.u + jnp.maximum(e, 0.0)
         return replace(self, l=l, u=u, radius=radius)
 
-    def _soft_violation(self, s: Array, rho: Array | float) -> Array:
-        """Return d ≥ 0 (m,): how far prox(v) stays outside a soft row; s: signed distance of v."""
+    def _stays_outside(self, s: Array, rho: Array | float) -> Array:
+        """Return which rows (m,) are soft and violated by prox(v); s: signed distance of v."""
         soft = finite(self.linear)
-        over = jnp.abs(s) - jnp.where(soft, self.linear, 0.0) / rho
-        beyond = soft & (over > 0)
-        return jnp.where(beyond, rho / (rho + self.quadratic) * jnp.where(beyond, over, 0.0), 0.0)
+        return soft & (jnp.abs(s) > jnp.where(soft, self.linear, 0.0) / rho)
 
     def _length(self, v: Array) -> Array:
         """Return |v|, with derivative 0 at v = 0."""

@@ -174,7 +174,23 @@ def test_status_is_true_and_bad_states_are_answered(tmp_path):
 
 
 @compiled
-@pytest.mark.slow
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_soft_rows_that_inputs_move_by_rounding(dtype, tmp_path):
+    """0.1 + 0.2 − 0.3 in B is 5.6e-17 and moves x₁ by nothing, so that the plan is that without."""
+    inputs = []
+    for k, moved in enumerate((0.0, 0.1 + 0.2 - 0.3)):
+        mpc = jm.MPC(
+            jm.LinearSystem(np.diag([0.9, 1.0]), [[moved], [1.0]]), [1.0, 1.0], 0.1, 3,
+            inputs=jm.Box(-0.5, 0.5), terminal_cost=[1.0, 1.0],
+            soft=jm.Soft([[1.0, 0.0]], upper=[0.6], rho=3.0),
+        )  # fmt: skip
+        solver = jm.ADMM(iterations=300, newton_steps=0)
+        u, status = Compiled(mpc, solver, tmp_path / str(k), dtype).step([1.0, 0.3])
+        assert status == 1
+        inputs.append(u)
+    np.testing.assert_allclose(*inputs, rtol=1e-6)
+
+
 def in_units(x, u, cost):
     """The pendulum in other units of its states (2,) and inputs (2,), and of its cost."""
     mpc = pendulum(horizon=3)

@@ -359,6 +359,14 @@ class TestBounds:
                     ).x
                     np.testing.assert_allclose(p_b[i], other, atol=1e-6 * (1 + high - low))
 
+    def test_prox_of_a_row_far_outside_pays_its_weight(self, x64):
+        """ρe is a subgradient of g at p: the weight c of a violated row, however far v is, and not
+        what is left of a difference of two far points."""
+        far = np.array([1e16, -1e16, 3e19, 5.0])
+        b = Bounds(np.zeros(4), np.zeros(4), np.array([0.3, 2.0, 1e-7, 4.0]), np.zeros(4))
+        e = self.each("prox_residual", b, far[None], np.full(1, 0.7))[0]
+        np.testing.assert_allclose(0.7 * e, [0.3, -2.0, 1e-7, 0.7 * 5], rtol=1e-14)
+
     def test_prox_of_balls_is_the_nearest_point(self, x64):
         """Inside, nothing moves; outside, the nearest point of a grid over ball (2 rows) or
         sphere (3 rows) is never nearer than p, and p lies on the ball."""
