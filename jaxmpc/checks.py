@@ -8,6 +8,7 @@ the command's help does without it.
 import difflib
 import math
 import os
+import re
 import shutil
 import unicodedata
 from collections.abc import Iterable, Mapping, Set
@@ -25,6 +26,7 @@ MOST_COUNT = 2**31 - 1
 
 def fail(argument: str, problem: str, cure: str) -> NoReturn:
     """Raise a ValueError that names the argument, what is wrong, and what to do."""
+    problem = re.sub(r"\bis a (?=[aeioAEIO]|MPC\b|LQR\b|Mj)", "is an ", problem)
     raise ValueError(printable(f"{argument}: {problem}. {cure}"))
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import jaxmpc as jm
+from jaxmpc.closed_loop import draw_disturbances, worst_disturbance
 from jaxmpc.pytrees import record
 
 A, B = np.array([[1, 0.01], [0, 1]]), np.array([[0], [0.2]])
@@ -37,6 +38,19 @@ LAW = jm.closed_loop.LinearFeedback(M, np.zeros((1, 2)))
 
 def fraction(x0s=((0, 0),), **more):
     return jm.feasible.feasible_fraction(M, x0s, **more)
+
+
+ROBUST = mpc(disturbance=jm.Box(-0.01, 0.01), disturbance_matrix=B, gain=np.zeros((1, 2)))
+TASK = jm.mpc.Task(lambda point: point.x[0], weight=1.0)
+
+
+def worst(x0):
+    law = jm.closed_loop.LinearFeedback(ROBUST, np.zeros((1, 2)))
+    return worst_disturbance(law, np.reshape(x0, (-1, 2)) if x0 == [] else x0, 3)
+
+
+def nonlinear(task, **more):
+    return jm.mpc.solve_nonlinear(jm.mpc.NonlinearMPC(M, S, (task,)), x, **more)
 
 
 class Returns:
@@ -71,7 +85,7 @@ CALLS = [
     ("x0: entries of type <U1 where real", lambda: jm.solve(M, ["a", "b"])),
     ("x0: entries of type complex128 where", lambda: jm.solve(M, x + 1j)),
     ("x0: [1, [2, 3]] is not an array of", lambda: jm.solve(M, [1, [2, 3]])),
-    ("x0: shape (3,). Give (2,); use", lambda: jm.solve(M, np.zeros(3))),
+    ("x0: shape (3,). Give (2,)", lambda: jm.solve(M, np.zeros(3))),
     ("x0: shape (5, 2). Give (2,); use", lambda: jm.solve(M, np.zeros((5, 2)))),
     ("x0: {'q': 1, 'dq': 2} where real", lambda: jm.solve(M, {"q": 1, "dq": 2})),
     ("x0: entries of type object where real", lambda: jm.solve(M, [None, None])),
@@ -79,18 +93,18 @@ CALLS = [
     ("reference: ADMM() where real", lambda: jm.solve(M, x, jm.ADMM())),
     ("reference: 'r' where real numbers are", lambda: jm.solve(M, x, "r")),
     ("reference: entries of type complex128 where", lambda: jm.solve(M, x, x + 1j)),
-    ("reference: shape (3,). Give (2,) or (4, 2);", lambda: jm.solve(M, x, np.zeros(3))),
+    ("reference: shape (3,). Give (2,) or (4, 2)", lambda: jm.solve(M, x, np.zeros(3))),
     ("solver: is a ndarray. Give a jm.ADMM", lambda: jm.solve(M, x, None, x)),
     ("solver: is a str. Give a jm.ADMM", lambda: jm.solve(M, x, solver="osqp")),
     ("solver: is a type. Give a jm.ADMM", lambda: jm.solve(M, x, solver=jm.ADMM)),
     ("warm_start: is a str. Give a Plan or a", lambda: jm.solve(M, x, warm_start="x")),
     ("warm_start: is a ndarray. Give a Plan or a", lambda: jm.solve(M, x, warm_start=x)),
     (
-        "input_reference: shape (2,). Give (1,) or (3, 1);",
+        "input_reference: shape (2,). Give (1,) or (3, 1)",
         lambda: jm.solve(M, x, input_reference=np.zeros(2)),
     ),
     (
-        "previous_input: shape (2,). Give (1,); use",
+        "previous_input: shape (2,). Give (1,)",
         lambda: jm.solve(M, x, previous_input=np.zeros(2)),
     ),
     ("previous_input: 'u' where real numbers are", lambda: jm.solve(M, x, previous_input="u")),
@@ -109,18 +123,18 @@ CALLS = [
         lambda: jm.solve_many(M, np.zeros((3, 2)), dtype="int8"),
     ),
     ("mpc: is a str. Give a jm.MPC", lambda: jm.Controller("x")(x)),
-    ("mpc: is a int. Give a jm.MPC", lambda: jm.Controller(3).plan(x)),
+    ("mpc: is an int. Give a jm.MPC", lambda: jm.Controller(3).plan(x)),
     ("solver: is a str. Give a jm.ADMM", lambda: jm.Controller(M, "s")),
-    ("qp: is a int. Give a jm.QP", lambda: jm.solve_qp(3)),
+    ("qp: is an int. Give a jm.QP", lambda: jm.solve_qp(3)),
     (
-        "mpc: is a int. Give a jm.MPC: controller.mpc, for an offset-free controller jm.closed",
+        "mpc: is an int. Give a jm.MPC: controller.mpc, for an offset-free controller jm.closed",
         lambda: jm.export.export_c(3, "nowhere"),
     ),
     ("qp: is a str. Give a jm.QP", lambda: jm.solve_qp("qp")),
     ("qp: is a NoneType. Give a jm.QP", lambda: jm.solve_qp(None)),
-    ("qp: is a MPC. Give a jm.QP", lambda: jm.solve_qp(M)),
+    ("qp: is an MPC. Give a jm.QP", lambda: jm.solve_qp(M)),
     ("qp: is a tuple. Give a jm.QP", lambda: jm.solve_qp((1, 2))),
-    ("solver: is a int. Give a jm.ADMM", lambda: jm.solve_qp(qp(), 3)),
+    ("solver: is an int. Give a jm.ADMM", lambda: jm.solve_qp(qp(), 3)),
     ("P: 'P' where real numbers are", lambda: jm.solve_qp(qp(P="P"))),
     ("P: None where real numbers are", lambda: jm.solve_qp(qp(P=None))),
     ("P: entries of type complex128 where", lambda: jm.solve_qp(qp(P=np.eye(2) * 1j))),
@@ -211,7 +225,7 @@ CALLS = [
         "smoothing: 's' where real numbers are",
         lambda: jm.solve(M, x, solver=jm.ADMM(smoothing="s")),
     ),
-    ("system: is a int. Give a jm.LinearSystem", lambda: mpc(system=3).validate()),
+    ("system: is an int. Give a jm.LinearSystem", lambda: mpc(system=3).validate()),
     ("system: is a ndarray. Give a", lambda: mpc(system=A).validate()),
     ("Q: 'Q' where real numbers are", lambda: mpc(Q="Q").validate()),
     ("Q: entries of type <U1 where real", lambda: mpc(Q=[["a", "b"], ["c", "d"]]).validate()),
@@ -237,10 +251,10 @@ CALLS = [
     ("horizon: needs ", lambda: jm.solve(mpc(horizon=10**6), x)),
     ("horizon: needs ", lambda: jm.solve(mpc(horizon=10**30), x)),
     ("horizon: needs ", lambda: jm.map_feasible_set(mpc(horizon=10**6), np.zeros((1, 2)))),
-    ("states: is a int. Give a Box or Polytope,", lambda: mpc(states=3).validate()),
+    ("states: is an int. Give a Box or Polytope,", lambda: mpc(states=3).validate()),
     ("states: is a tuple. Give a Box or", lambda: mpc(states=(-1, 1)).validate()),
     (
-        "states: is a Ellipsoid. Give a Box or",
+        "states: is an Ellipsoid. Give a Box or",
         lambda: mpc(states=jm.Ellipsoid(np.eye(2), 1.0)).validate(),
     ),
     ("states: has dimension 1 where 2 is", lambda: mpc(states=jm.Box([-1], [1])).validate()),
@@ -610,7 +624,7 @@ CALLS = [
     ),
     ("system: is a str. Give a jm.LinearSystem", lambda: jm.design("S", np.eye(2), np.eye(1), 3)),
     ("model: 'nothing' is no file. Give a", lambda: jm.load_robot("nothing")),
-    ("model: is a int. Give a name, a path or", lambda: jm.load_robot(3)),
+    ("model: is an int. Give a name, a path or", lambda: jm.load_robot(3)),
     ("model: is a NoneType. Give a name, a", lambda: jm.load_robot(None)),
     (
         "control_period: -1 is not a positive number. Give",
@@ -674,8 +688,8 @@ CALLS = [
     ("horizons: 3 is not a list. Give a", lambda: jm.feasible.feasible_growth(M, 3)),
     ("horizons: 0. Give a whole number of at", lambda: jm.feasible.feasible_growth(M, [3, 0])),
     ("horizons: 2.5. Give a whole number of at", lambda: jm.feasible.feasible_growth(M, [2.5])),
-    ("mpc: is a int. Give a jm.MPC", lambda: jm.feasible.feasible_growth(3, [3])),
-    ("mpc: is a int. Give a jm.MPC", lambda: jm.recursion.smallest_horizon(3)),
+    ("mpc: is an int. Give a jm.MPC", lambda: jm.feasible.feasible_growth(3, [3])),
+    ("mpc: is an int. Give a jm.MPC", lambda: jm.recursion.smallest_horizon(3)),
     ("seed: 1.5. Give a whole number of at", lambda: BOX.sample(2, seed=1.5)),
     ("seed: True. Give a whole number of at", lambda: BOX.to_polytope().sample(2, seed=True)),
     ("seed: -1. Give a whole number of at", lambda: BOX.to_zonotope().sample(2, seed=-1)),
@@ -683,7 +697,7 @@ CALLS = [
         "seed: 'a'. Give a whole number of at",
         lambda: jm.Ellipsoid(np.eye(2), 1).sample(2, seed="a"),
     ),
-    ("run: is a int. Give a", lambda: jm.tuning.transfer_penalties(3, M)),
+    ("run: is an int. Give a", lambda: jm.tuning.transfer_penalties(3, M)),
     ("axes: 0 is not a list. Give state", lambda: jm.map_feasible_set(M, x, axes=0)),
     ("x0s: shape (). Give points (B, 2), one", lambda: jm.map_feasible_set(M, 3)),
     ("devices: array(2). Give a whole", lambda: jm.solve_many(M, [x], devices=np.array(2))),
@@ -695,7 +709,7 @@ CALLS = [
     ("along: has arrays of shapes [(), ()].", lambda: sweep([1, 1])),
     ("shard: 3 is not a list. Give i and n of", lambda: sweep([x, x], shard=3)),
     ("shard: 1. Give i and n of i/n, with i from", lambda: sweep([x, x], shard=(1,))),
-    ("settings: is a int. Give a Mapping", lambda: sweep([x, x], settings=3)),
+    ("settings: is an int. Give a Mapping", lambda: sweep([x, x], settings=3)),
     (
         "max_iterations: [3]. Give a whole number",
         lambda: jm.maximal_invariant_set(S, [[-1, -1]], BOX, M.inputs, max_iterations=[3]),
@@ -704,12 +718,12 @@ CALLS = [
         "tolerance: [1]. Give a relative gap",
         lambda: jm.sets.maximal_control_invariant_set(S, BOX, M.inputs, tolerance=[1]),
     ),
-    ("system: is a int. Give a jm.LinearSystem", lambda: jm.sets.predecessor(3, BOX, BOX, BOX)),
+    ("system: is an int. Give a jm.LinearSystem", lambda: jm.sets.predecessor(3, BOX, BOX, BOX)),
     (
         "disturbance_matrix: shape () where (2,)",
         lambda: jm.sets.predecessor(S, BOX, BOX, M.inputs, BOX, 3),
     ),
-    ("system: is a int. Give a jm.LinearSystem", lambda: jm.sets.reachable_sets(3, BOX, BOX)),
+    ("system: is an int. Give a jm.LinearSystem", lambda: jm.sets.reachable_sets(3, BOX, BOX)),
     ("sets: hold a int. Give Boxes, Polytopes", lambda: jm.sets.plot(3)),
     ("names: 3 is not a list. Give a list", lambda: jm.joint_limits(1.0, names=3)),
     ("units: 3 is not a list. Give three", lambda: jm.joint_limits(1.0, units=3)),
@@ -718,7 +732,7 @@ CALLS = [
         lambda: jm.sets.output_limits([[1]], -1, 1, names=[None]),
     ),
     (
-        "law: is a int. Give a jm.systems.LQR",
+        "law: is an int. Give a jm.systems.LQR",
         lambda: jm.sets.named_terminal_set("invariant", S, 3, BOX, M.inputs),
     ),
     ("pieces: 3 is not a list. Give a tuple", lambda: jm.sets.PolytopeUnion(3)),
@@ -728,6 +742,22 @@ CALLS = [
     ("seconds: (). Give a time limit in", lambda: jm.explicit.critical_regions(M, seconds=())),
     ("seconds: (). Give a time limit in", lambda: jm.explicit.exact_penalty(M, seconds=())),
     ("rho: 'x' where real numbers are needed.", lambda: jm.explicit.exact_penalty(M, rho="x")),
+    ("mpc: is a LinearFeedback. Give a jm.MPC", lambda: draw_disturbances(LAW, 3, 2)),
+    ("controller: is an MPC. Give a Controller", lambda: worst_disturbance(M, x, 3)),
+    ("x0: shape (0, 2). Give (B, 2), B ≥ 1", lambda: worst([])),
+    ("x0: shape (1, 2, 2). Give (B, 2), B ≥ 1", lambda: worst([[x, x]])),
+    ("x0: holds NaN or infinity. Give", lambda: worst([[0, 0], [np.nan, 0]])),
+    ("compensate: is a str. Give True or", lambda: jm.simulate(LAW, S, x, 3, compensate="no")),
+    ("x0: shape (2, 1). Give (2,): x0.ravel()", lambda: jm.solve(M, x[:, None])),
+    ("x0: shape (3, 2). Give (2,); use jax.vmap", lambda: jm.solve(M, np.zeros((3, 2)))),
+    ("x0: shape (3,). Give (2,)", lambda: jm.solve(M, np.zeros(3))),
+    ("a.function: is a str. Give a function", lambda: nonlinear(jm.mpc.Task("cos", name="a"))),
+    (
+        "task: has neither a weight nor limits. Give",
+        lambda: nonlinear(jm.mpc.Task(lambda point: point.x[0])),
+    ),
+    ("targets: 3.0 is not a list. Give one", lambda: nonlinear(TASK, targets=3.0)),
+    ("scale: shape (2,). Give (9,), one number", lambda: nonlinear(TASK, scale=[1.0, 2.0])),
 ]
 
 
@@ -910,6 +940,14 @@ def test_a_plant_that_is_not_written_in_jax_is_told_what_helps(plant):
         jm.simulate(LAW, plant, x, 3)
     with pytest.raises(ValueError, match="plant: is not written in JAX .* Use jax.numpy"):
         jm.simulate_many(LAW, plant, [x], 3)
+
+
+@pytest.mark.parametrize("plant", [lambda t, x, u: x, lambda u, x: A @ x + B @ u])
+def test_a_plant_of_other_arguments_is_told_its_own(plant):
+    with pytest.raises(ValueError, match="plant: cannot be called .* is a function of a state"):
+        jm.simulate(LAW, plant, x, 3)
+    with pytest.raises(ValueError, match="model or task: cannot be called .* in this order"):
+        jm.mpc.solve_nonlinear(jm.mpc.NonlinearMPC(M, plant), x)
 
 
 def test_errors_inside_a_constructor_stay_what_they_are():

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxmpc.arrays import Reals, as_array, host_array
-from jaxmpc.checks import fail, generator, whole
-from jaxmpc.closed_loop.simulation import simulate
+from jaxmpc.arrays import Reals, host_array
+from jaxmpc.checks import fail, generator, require_finite, require_kind, whole
+from jaxmpc.closed_loop.simulation import initial_states, require_controller, simulate
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.sets.disturbances import disturbance_columns
 
@@ -48,13 +48,17 @@ def worst_disturbance(
     search: it finds violations, and proves nothing where there are none.
 
     controller: of a robust problem with state limits. x0: (n,) or (B, n). plant: None for its
-    own model. rounds: at most.
+    own model. rounds: at most. A loop that overflows has a violation of NaN.
     """
+    require_controller(controller)
     mpc = controller.mpc
     W, E = _disturbances(mpc)
     if controller.limits is None:
         fail("controller", "has no state limits to exceed", "Give states to its problem")
     steps, rounds = whole("steps", steps, 1), whole("rounds", rounds, 1)
+    rng, x0 = generator(seed), host_array("x0", x0)
+    require_finite("x0", x0)
+    starts = initial_states(controller, np.atleast_2d(x0), "x0")
     corners = W.vertices() @ E.T
     plant = mpc.system if plant is None else plant
     cast = lambda tree: jax.tree.map(lambda v: jnp.asarray(v, controller.dtype), tree)
@@ -65,18 +69,16 @@ def worst_disturbance(
         return jnp.max(jax.vmap(lambda x: _signed(limits, x))(run.states[1:]))
 
     rise = jax.jit(jax.vmap(jax.value_and_grad(beyond)))
-    rng, starts = generator(seed), np.atleast_2d(host_array("x0", x0))
     w = corners[rng.integers(len(corners), size=(len(starts), steps))]
     best, top = w, np.full(len(starts), -np.inf)
     for _ in range(rounds):
         value, slope = (np.asarray(v, float) for v in rise(*cast((w, starts))))
-        better = value > top
+        better = ~(value <= top)
         if not better.any():
             break
-        best = np.where(better[:, None, None], w, best)
-        top = np.where(better, value, top)
+        best, top = np.where(better[:, None, None], w, best), np.maximum(top, value)
         w = corners[np.argmax(slope @ corners.T, axis=2)]
-    return (best[0] if as_array(x0).ndim == 1 else best), float(top.max())
+    return (best[0] if x0.ndim == 1 else best), float(top.max())
 
 
 def _signed(limits: Any, x: Array) -> Array:
@@ -88,6 +90,7 @@ def _signed(limits: Any, x: Array) -> Array:
 
 def _disturbances(mpc: MPC) -> tuple[Any, np.ndarray]:
     """Return W and E of a robust problem."""
+    require_kind("mpc", mpc, MPC)
     if mpc.disturbance is None:
         fail("mpc", "has no disturbance", "Give MPC(disturbance=jm.Box(…))")
     n = mpc.system.n

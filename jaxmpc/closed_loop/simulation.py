@@ -168,7 +168,7 @@ def simulate(
     """
     aims = (reference, input_reference)
     added = disturbance, output_disturbance, forecast
-    given = Conditions(*aims, *added, previous_input, noise, observer, delay, bool(compensate))
+    given = Conditions(*aims, *added, previous_input, noise, observer, delay, compensate)
     plant, x0, given = checked_loop(controller, plant, x0, steps, given)
     return _simulate(controller, plant, x0, given, steps=int(steps), checkpoint=checkpoint)
 
@@ -194,12 +194,8 @@ def checked_loop(
 ) -> tuple[Any, Array, Conditions]:
     """Return plant, initial state and conditions as arguments of a program, in the controller's
     precision; raise ValueError where one is wrong."""
-    if isinstance(controller, LinearFeedback):
-        controller.validate()
-    if not hasattr(controller, "mpc"):
-        what = f"is a {type(controller).__name__}"
-        cure = "Give a Controller, RobotController, NonlinearController or LinearFeedback"
-        fail("controller", what, cure)
+    require_controller(controller)
+    require_kind("compensate", given.compensate, bool, np.bool_, cure="Give True or False")
     n, size = controller.mpc.system.n, controller.state_size
     whole("steps", steps, 1)
     aim = checked_aim(
@@ -259,8 +255,19 @@ def checked_loop(
         noise=noise,
         observer=observer,
         delay=int(given.delay),
+        compensate=bool(given.compensate),
     )
     return plant, aim.x0, given
+
+
+def require_controller(controller: Any) -> None:
+    """Raise ValueError unless a closed loop can be run with this controller."""
+    if isinstance(controller, LinearFeedback):
+        controller.validate()
+    if not hasattr(controller, "mpc"):
+        what = f"is a {type(controller).__name__}"
+        cure = "Give a Controller, RobotController, NonlinearController or LinearFeedback"
+        fail("controller", what, cure)
 
 
 def _checked_plant(plant: Any, n: int, m: int) -> Any:
@@ -456,14 +463,14 @@ def _simulate(
     return replace(run, states=states, violation=jnp.append(run.violation, loop.violation(last)))
 
 
-def initial_states(owner: Any, x0s: Reals) -> np.ndarray:
+def initial_states(owner: Any, x0s: Reals, argument: str = "x0s") -> np.ndarray:
     """Return initial states (B, n), checked against the length of those of a controller or plant,
     where that has one."""
-    require_real("x0s", x0s)
+    require_real(argument, x0s)
     found, size = numpy_array(x0s), getattr(owner, "state_size", None)
     if found.ndim != 2 or not len(found) or size not in (None, found.shape[1]):
         cure = f"Give (B, {size or 'n'}), B ≥ 1, one initial state a row"
-        fail("x0s", f"shape {found.shape}", cure)
+        fail(argument, f"shape {found.shape}", cure)
     return found
 
 
@@ -524,7 +531,7 @@ def simulate_many(
     devices = chosen_devices(devices)
     aims = (reference, input_reference)
     added = disturbance, output_disturbance, forecast
-    given = Conditions(*aims, *added, previous_input, noise, observer, delay, bool(compensate))
+    given = Conditions(*aims, *added, previous_input, noise, observer, delay, compensate)
     plant, _, shared = checked_loop(controller, plant, x0s[0], steps, given)
     several = {"reference": references, "input_reference": input_references}
     several["disturbance"] = disturbances

@@ -35,7 +35,7 @@ from jaxmpc.batches import (
     padded,
     to_host,
 )
-from jaxmpc.checks import fail
+from jaxmpc.checks import fail, require_finite
 from jaxmpc.feasible import proofs
 from jaxmpc.feasible.hull_labels import (
     GAP,
@@ -337,8 +337,9 @@ def affine_policies(mpc: MPC | PolicyProblem, x0s: Reals) -> AffinePolicies:
     if not isinstance(problem, PolicyProblem) or problem.mpc.policy != "affine":
         fail("mpc", "has no affine policy", 'Give MPC(disturbance=..., policy="affine")')
     points = host_array("x0s", x0s)
-    if points.ndim != 2 or points.shape[1] != problem.dimension:
-        fail("x0s", f"shape {points.shape}", f"Give points (B, {problem.dimension})")
+    if points.ndim != 2 or not len(points) or points.shape[1] != problem.dimension:
+        fail("x0s", f"shape {points.shape}", f"Give points (B, {problem.dimension}), B ≥ 1")
+    require_finite("x0s", points)
     v, M = policy_hull(problem).policies(points)
     center, gamma = (np.asarray(part, float) for part in directions(problem.mpc))
     (B, _), N, m, p = v.shape, problem.mpc.horizon, problem.mpc.system.m, len(center)

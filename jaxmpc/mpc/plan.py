@@ -131,7 +131,11 @@ def checked_array(name: str, value: Any, shapes: Sequence[tuple[int, ...]]) -> A
     if np.shape(value) == () and (1,) in shapes:
         value = value.reshape(1)
     if np.shape(value) not in shapes:
-        cure = f"Give {' or '.join(map(str, shapes))}; use jax.vmap for many"
+        cure = f"Give {' or '.join(map(str, shapes))}"
+        if (np.size(value),) in shapes:
+            cure = f"{cure}: {name}.ravel()"
+        elif any(np.shape(value)[1:] == shape for shape in shapes):
+            cure = f"{cure}; use jax.vmap for many"
         fail(name, f"shape {np.shape(value)}", cure)
     return value
 

@@ -592,7 +592,8 @@ class MPC:
             require_finite("disturbance_matrix", self.disturbance_matrix)
         require_disturbance("disturbance", W, self.disturbances)
         off_centre = isinstance(W, Box | Zonotope) and concrete(W) and not is_centred(W)
-        if self.policy == "affine" and self.control_horizon is not None and off_centre:
+        held = len(set(self.moves)) < self.horizon
+        if self.policy == "affine" and held and off_centre:
             cure = "Move its centre w into system.c, by disturbance_matrix times w, and W by -w"
             what = "is not symmetric about 0, where a control horizon holds affine policies"
             fail("disturbance", what, cure)

@@ -54,13 +54,16 @@ def as_array_of_numbers(found: Any) -> Any:
 
 @contextmanager
 def written_in_jax(what: str) -> Iterator[None]:
-    """Turn errors of JAX about a user's function, while it is traced, into a ValueError."""
+    """Turn errors about types of a user's function, while it is traced, into a ValueError."""
     try:
         yield
-    except jax.errors.JAXTypeError as error:
-        problem = f"is not written in JAX ({str(error).splitlines()[0]})"
-        cure = "Use jax.numpy in place of numpy, and jnp.where or jax.lax.cond in place of if"
-        fail(what, problem, cure)
+    except TypeError as error:
+        text = (str(error).splitlines() or [""])[0]
+        if isinstance(error, jax.errors.JAXTypeError):
+            cure = "Use jax.numpy in place of numpy, and jnp.where or jax.lax.cond in place of if"
+            fail(what, f"is not written in JAX ({text})", cure)
+        cure = "A model or plant is a function of a state (n,) and inputs (m,), in this order"
+        fail(what, f"cannot be called ({text})", f"{cure}; a task is one of what `view` gives")
 
 
 def _same(a: Any, b: Any) -> bool:

@@ -34,6 +34,23 @@ def test_sequences():
         draw_disturbances(jm.MPC(SYSTEM, np.eye(2), 0.1, 4, X, U), 7, 5)
 
 
+class Overflows:
+    """A plant whose next state is no number."""
+
+    def step(self, x, u):
+        return x * np.nan
+
+
+def test_starts_may_be_lists_and_a_loop_that_overflows_has_no_distance():
+    mpc = robust(0.2, terminal_set=None, gain=np.array([[-0.6, -1.0]]))
+    law = jm.closed_loop.LinearFeedback(mpc, [[-0.6, -1.0]])
+    found, beyond = worst_disturbance(law, [0.5, 0.0], 4, seed=1)
+    same, as_array = worst_disturbance(law, np.array([0.5, 0.0]), 4, seed=1)
+    np.testing.assert_array_equal(found, same)
+    assert beyond == as_array < 0
+    assert np.isnan(worst_disturbance(law, [0.5, 0.0], 4, plant=Overflows())[1])
+
+
 @pytest.mark.slow
 def test_no_sequence_breaks_a_limit():
     """From a state near a limit; the sequence found by gradient is no better than random ones."""

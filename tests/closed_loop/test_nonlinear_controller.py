@@ -279,7 +279,7 @@ def test_a_bad_reading_spoils_no_later_step(run):
 @pytest.mark.parametrize(
     ("argument", "make"),
     [
-        ("problem: is a MPC", lambda p: jm.NonlinearController(p.mpc)),
+        ("problem: is an MPC", lambda p: jm.NonlinearController(p.mpc)),
         ("sqp_steps: 0", lambda p: jm.NonlinearController(p, sqp_steps=0)),
         ("hessian: 'bfgs'", lambda p: jm.NonlinearController(p, hessian="bfgs")),
         ("solver: is a str", lambda p: jm.NonlinearController(p, "fast")),

@@ -433,7 +433,7 @@ def test_bad_arguments_are_named(controller):
         ),
         (lambda: observer("input").prepared(), "observer.disturbance: is a tuple. Give a closed"),
         (lambda: OffsetFreeController(controller, odd), "observer.disturbance: is empty"),
-        (lambda: OffsetFreeController(MPC, good), "controller: is a MPC"),
+        (lambda: OffsetFreeController(MPC, good), "controller: is an MPC"),
         (lambda: OffsetFreeController(controller, SYSTEM), "observer: is a LinearSystem"),
         (lambda: OffsetFreeController(state, good), "controller: linearises about the state. Give"),
         (

@@ -131,7 +131,7 @@ def test_plants_disturbance_and_references():
         ({"input_reference": np.zeros(2)}, "input_reference"),
         ({"disturbance": np.zeros((4, 2))}, "disturbance"),
         ({"previous_input": np.zeros(2)}, "previous_input"),
-        ({"plant": object()}, "plant: is a object"),
+        ({"plant": object()}, "plant: is an object"),
         ({"plant": problems.joint().system}, "plant: has 2 states and 1 inputs"),
     ],
 )

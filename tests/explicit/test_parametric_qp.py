@@ -310,7 +310,7 @@ def test_errors():
     ]:
         with pytest.raises(ValueError, match=message):
             critical_regions(replace(qp, **changes), box)
-    with pytest.raises(ValueError, match="problem: is a int"):
+    with pytest.raises(ValueError, match="problem: is an int"):
         critical_regions(3)
     with pytest.raises(ValueError, match="within: has dimension 2"):
         critical_regions(qp, jm.Box([-1, -1], [1, 1]))

@@ -98,7 +98,7 @@ def test_errors_of_the_labels_are_raised_at_once():
     with pytest.raises(ValueError, match="^devices: 999 where this process has"):
         jm.map_feasible_set(problems.lecture(), POINTS, devices=999, **one_part)
     assert executor.submitted == 1
-    with pytest.raises(ValueError, match="executor: is a int without submit"):
+    with pytest.raises(ValueError, match="executor: is an int without submit"):
         jm.map_feasible_set(problems.lecture(), POINTS, executor=3)
 
 

@@ -437,7 +437,7 @@ BAD = {
         "model or task: is not written in JAX",
     ),
     "tasks": (lambda p: solve_nonlinear(replace(p, tasks=(3,)), START), "tasks: is a tuple"),
-    "problem": (lambda p: solve_nonlinear(p.mpc, START), "problem: is a MPC"),
+    "problem": (lambda p: solve_nonlinear(p.mpc, START), "problem: is an MPC"),
 }  # fmt: skip
 
 

@@ -216,7 +216,7 @@ def test_deviations_are_the_same_problem():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"robot": object()}, "robot: is a object"),
+        ({"robot": object()}, "robot: is an object"),
         ({"mpc": "joint"}, "mpc: is a str. Give a jm.MPC"),
         ({"target": [np.nan]}, "target: "),
         ({"target": [1.0, 2.0]}, r"target: shape \(2,\)"),

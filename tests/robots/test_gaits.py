@@ -96,7 +96,7 @@ def test_periodic_lqr_of_a_slow_loop_is_found():
     [
         ({"Q": np.ones(2)}, r"Q: shape \(2,\) where \(3, 3\)"),
         ({"R": 1.0}, r"R: shape \(\) where \(2, 2\)"),
-        ({"solver": 3}, "solver: is a int"),
+        ({"solver": 3}, "solver: is an int"),
         ({"rho": -1.0}, "rho: -1.0"),
     ],
 )

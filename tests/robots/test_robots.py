@@ -656,7 +656,7 @@ def test_bad_urdf_and_names(tmp_path):
     for name in ("arm9", "nowhere.xml", tmp_path):
         with pytest.raises(ValueError, match="model: .* is no file. Give a path, or one of joint"):
             jm.load_robot(name)
-    with pytest.raises(ValueError, match="model: is a int. Give a name, a path"):
+    with pytest.raises(ValueError, match="model: is an int. Give a name, a path"):
         jm.load_robot(3)
 
 

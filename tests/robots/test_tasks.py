@@ -205,7 +205,7 @@ class TestFunctions:
             (lambda r: tasks.distance(r, "left", ([0, 0, 0],)), "second: .*Give the name"),
             (lambda r: tasks.distance(r, "left", ([0, np.nan, 0], 1)), r"second\[0\]: holds NaN"),
             (lambda r: tasks.distance(r, "left", ([0, 0, 0], -1)), r"second\[1\]: -1. Give a"),
-            (lambda r: tasks.energy(5), "robot: is a int. Give a jm.robots.Robot"),
+            (lambda r: tasks.energy(5), "robot: is an int. Give a jm.robots.Robot"),
         ],
     )
     def test_errors(self, two, make, text):

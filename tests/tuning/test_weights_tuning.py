@@ -103,7 +103,7 @@ def test_losses_that_cannot_be_traced_are_named(x64):
     for more, message in (
         ({"loss": lambda run: float(run.states[-1, 0])}, "loss, make_mpc: cannot be traced by JAX"),
         ({"make": lambda v: replace(MPC, Q=v["W"])}, "parameters: have no 'W', .*Q, R"),
-        ({"make": MPC}, "make_mpc: is a MPC. Give a function"),
+        ({"make": MPC}, "make_mpc: is an MPC. Give a function"),
     ):
         with pytest.raises(ValueError, match=message):
             tune(**more)

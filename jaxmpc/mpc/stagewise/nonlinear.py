@@ -111,9 +111,11 @@ class Task:
             values = np.asarray(self.weight, float)
             values = np.diag(values) if values.ndim == 1 else np.atleast_2d(values)
             require_symmetric_psd(f"{name}.weight", values)
+        cure = "Give weight= for a cost, or lower= and upper= for limits"
         if self.target is not None and self.weight is None:
-            cure = "Give weight= for a cost, or lower= and upper= for limits"
             fail(f"{name}.target", "is given without a weight", cure)
+        if self.weight is None and not self.limited:
+            fail(name, "has neither a weight nor limits", cure)
         if self.rho is not None and concrete(self.rho) and not float(self.rho) >= 0:
             fail(f"{name}.rho", f"{self.rho}", "Give at least 0, or None for hard limits")
         if self.limited and concrete(self.lower, self.upper):
@@ -207,6 +209,12 @@ class NonlinearMPC:
             fail("model", f"is a {type(self.model).__name__}", "Give f(x, u) -> x⁺, or its object")
         if not isinstance(self.tasks, tuple) or not all(isinstance(t, Task) for t in self.tasks):
             fail("tasks", f"is a {type(self.tasks).__name__}", "Give a tuple of jm.mpc.Task")
+        for task in self.tasks:
+            if not callable(task.function):
+                what = f"is a {type(task.function).__name__}"
+                fail(
+                    f"{task.name}.function", what, "Give a function of what the model's view gives"
+                )
         after, values, _ = self._shapes()
         if after != (self.mpc.system.n,):
             cure = f"Give the next state ({self.mpc.system.n},), as mpc.system has it"

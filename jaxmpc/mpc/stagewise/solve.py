@@ -149,13 +149,18 @@ def factor_stages(mpc: MPC, solver: ADMM = DEFAULT, scale: Reals | None = None) 
     """
     mpc = checked(mpc, solver)
     rows = row_count(layout(mpc))
-    shape = (rows,) if scale is None else np.shape(as_array(scale))
-    if shape != (rows,):
-        fail("scale", f"shape {shape}", f"Give ({rows},), one number a row")
+    require_row_scale(scale, rows)
     answers = answers_disturbances(mpc)
     steps = solver.admm_steps(ADMM_STEPS) > 0 and not answers
     mpc = without_disturbance(mpc) if answers else mpc
     return _factor(*arrays((mpc, solver.rho, scale)), steps=steps)
+
+
+def require_row_scale(scale: Reals | None, rows: int) -> None:
+    """Raise ValueError unless a row scale has a number for each row."""
+    shape = (rows,) if scale is None else np.shape(as_array(scale))
+    if shape != (rows,):
+        fail("scale", f"shape {shape}", f"Give ({rows},), one number a row")
 
 
 def checked(mpc: MPC, solver: ADMM) -> MPC:

@@ -29,7 +29,7 @@ from jax import Array
 from jax.typing import DTypeLike
 
 from jaxmpc.arrays import Reals, all_finite
-from jaxmpc.checks import fail, require_kind, whole
+from jaxmpc.checks import entries, fail, require_kind, whole
 from jaxmpc.mpc.plan import Aim, Plan, WarmStart, answer, checked_aim, checked_array
 from jaxmpc.mpc.rows import dynamics_terms, row_count, split, spread
 from jaxmpc.mpc.stagewise.newton_steps import (
@@ -52,6 +52,7 @@ from jaxmpc.mpc.stagewise.solve import (
     StageFactor,
     checked,
     full_aim,
+    require_row_scale,
     scaled,
     stage_solution,
 )
@@ -124,10 +125,11 @@ def solve_nonlinear(
     solver = checked_search(problem, solver, iterations, hessian)
     mpc = problem.mpc
     s = jax.eval_shape(Stages.of, mpc)
-    aim = checked_aim(mpc, x0, reference, input_reference, previous_input)
-    aim = full_aim(mpc, aim, s.P.dtype)
-    aim = aim._replace(targets=_full_targets(problem, targets, s.P.dtype))
     rows = (*s.layout, *task_layout(problem))
+    require_row_scale(scale, row_count(rows))
+    aim = checked_aim(mpc, x0, reference, input_reference, previous_input)
+    every_target = _full_targets(problem, targets, s.P.dtype)
+    aim = full_aim(mpc, aim, s.P.dtype)._replace(targets=every_target)
     if warm_start is None:
         x = jnp.broadcast_to(aim.x0, aim.states.shape)
         u = jnp.broadcast_to(aim.inputs[:1], aim.inputs.shape)
@@ -166,7 +168,9 @@ def _full_targets(
 ) -> tuple[Array, ...]:
     """Return the targets of all tasks at all stages, (N+1, p) each: those given, or the tasks'
     own. Raises ValueError for wrong shapes."""
-    given = [task.target for task in problem.tasks] if targets is None else list(targets)
+    cure = "Give one for each task, None for the task's own"
+    own = [task.target for task in problem.tasks]
+    given = own if targets is None else entries("targets", targets, cure)
     if len(given) != len(problem.tasks):
         fail("targets", f"{len(given)} for {len(problem.tasks)} tasks", "Give one for each task")
     full = []
