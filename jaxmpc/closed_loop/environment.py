@@ -18,7 +18,7 @@ from jaxmpc.qp.linalg import matmul
 from jaxmpc.robots.description import host_coordinates
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.robot import Robot
-from jaxmpc.sets.limits import TOLERANCE, worst_violation
+from jaxmpc.sets.limits import rows_kept, worst_violation
 
 
 @pytree
@@ -149,7 +149,7 @@ class Environment:
         violation = worst_violation(limits, xi)
         ended = jnp.isnan(violation)
         if self.stop_at_limits:
-            ended = ended | (violation > TOLERANCE[xi.dtype.name])
+            ended = ended | ~jnp.all(rows_kept(limits, xi))
         return EnvironmentState(
             x=x,
             observation=xi,

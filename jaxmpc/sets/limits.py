@@ -18,8 +18,8 @@ from jaxmpc.checks import entries, fail, require_finite
 from jaxmpc.pytrees import record
 from jaxmpc.sets.convex_sets import Box, Polytope, product
 
-# A limit counts as kept where it is exceeded by at most this, in its unit; relative to the bound
-# where that is above 1, since float32 holds 150 N m only to 1e-5.
+# A limit counts as kept where it is exceeded by at most this, in parts of the bound, as float32
+# holds 150 N m only to 1e-5; see `rows_kept`.
 TOLERANCE = {"float64": 1e-6, "float32": 1e-4}
 
 # A set, rows (H, lower, upper) of lower ≤ H x ≤ upper, or None for none.
@@ -219,13 +219,19 @@ def rows_kept(limits: Limits, x: Values, dtype: DTypeLike | None = None) -> Valu
     """Return whether each point keeps each row to within `TOLERANCE`, (..., rows); False where x is
     not finite.
 
+    The tolerance is in parts of the bound; of a bound that is smaller than the other one of its
+    row, in parts of that or in the unit of the row, whichever is less.
+
     dtype: the precision in which x was computed, if other than that of x.
     """
     xp, value, lower, upper = _row_values(limits, x)
     relative = TOLERANCE[str(np.dtype(value.dtype if dtype is None else dtype))]
+    size = lambda end: xp.where(xp.isfinite(end), xp.abs(end), 0.0)
+    larger = xp.maximum(size(lower), size(upper))
 
     def room(end: Values) -> Values:
-        return relative * xp.maximum(1.0, xp.where(xp.isfinite(end), xp.abs(end), 0.0))
+        most = xp.where(larger > 0, larger, 1.0)
+        return relative * xp.minimum(xp.maximum(1.0, size(end)), most)
 
     return (value - upper <= room(upper)) & (lower - value <= room(lower))
 

@@ -27,6 +27,16 @@ def test_polygons_fill_the_set():
     assert plot_regions(regions, show="value").get_xlabel() == "x1"
 
 
+@pytest.mark.parametrize("units", [(1e6, 1e-6), (1e-6, 1e6), (1.0, 1e-9)])
+def test_polygons_fill_the_set_in_any_units(units):
+    unit = np.array(units)
+    A, B = unit[:, None] * np.array([[1, 1], [0, 1.0]]) / unit, unit * [0.5, 1.0]
+    box = jm.Box(-5 * unit, 5 * unit)
+    mpc = jm.MPC(jm.LinearSystem(A, B), 1 / unit**2, 0.1, 2, box, U, terminal_set=box)
+    regions = critical_regions(mpc)
+    assert area(plot_regions(regions)) == pytest.approx(regions.volume, rel=1e-6)
+
+
 def test_the_colour_bar_says_what_it_measures_beside_the_axes():
     system = jm.LinearSystem([[1, 1], [0, 1.0]], [0.5, 1], input_names=("F",), input_units=("N",))
     regions = critical_regions(jm.MPC(system, [1.0, 1], 0.1, 2, X, U))

@@ -18,7 +18,7 @@ from jaxmpc.app.plots import (
     plot_recursion,
     plot_robot_map,
 )
-from jaxmpc.app.plots.closed_loops import plot_before_after, plot_runs
+from jaxmpc.app.plots.closed_loops import BROKEN, plot_before_after, plot_runs
 from jaxmpc.app.plots.style import FEASIBLE, INFEASIBLE
 from jaxmpc.app.plots.tuning import plot_maps, plot_solver, plot_trade_off, plot_tuning
 from jaxmpc.closed_loop.outcome import summarise_runs
@@ -96,6 +96,24 @@ def test_grid_becomes_an_image_with_first_state_to_the_right():
     ]
     reach = [np.abs(line.get_xdata()).max() for line in ax.lines]
     np.testing.assert_allclose(reach, [0.5, 1.2, 1.0])
+
+
+@pytest.mark.parametrize("order", ["rising", "falling", "shuffled", "uneven"])
+def test_cells_have_the_labels_of_their_states(order):
+    x, y = np.linspace(-2, 2, 9), np.linspace(-1.9, 1.5, 7)
+    y = y**3 if order == "uneven" else y[::-1] if order == "falling" else y
+    points = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+    if order == "shuffled":
+        points = np.random.default_rng(0).permutation(points)
+    fmap = Map(points)
+    ax = plot_feasible_set(fmap)
+    if order == "uneven":
+        assert not ax.images
+        return
+    cells, (left, right, low, high) = ax.images[0].get_array(), ax.images[0].get_extent()
+    i = ((points[:, 0] - left) / (right - left) * cells.shape[1]).astype(int)
+    j = ((points[:, 1] - low) / (high - low) * cells.shape[0]).astype(int)
+    np.testing.assert_array_equal(cells[j, i], fmap.label)
 
 
 def test_cells_end_at_the_bounds(tmp_path):
@@ -453,6 +471,16 @@ def test_a_plan_over_its_horizon():
     np.testing.assert_allclose(q.lines[3].get_xdata(), [0.2])
     np.testing.assert_allclose(torque.lines[3].get_xdata(), [0.2, 0.3])
     require_no_empty_panel(figure)
+    # Each row is one of its own: beside one of inputs, with rounding, and in any unit.
+    for unit in (1.0, 1e-7):
+        C, D = [[1, 5.6e-17], [0, 0]], [[0], [1]]
+        soft = jm.Soft(C, upper=np.array([0.5 * unit, 9]), D=D, rho=2.0, stages=(2, 3))
+        scaled = dataclasses.replace(plan, states=x * unit)
+        changed = dataclasses.replace(mpc, states=None, outputs=(), soft=(soft,))
+        ax = plot_plan(scaled, changed).axes[0]
+        np.testing.assert_allclose(ax.lines[2].get_ydata()[2:], 0.5 * unit)
+        red = [line for line in ax.lines if line.get_color() == BROKEN]
+        np.testing.assert_array_equal(red[0].get_ydata(), unit * x[2:, 0][x[2:, 0] > 0.5])
     lost = dataclasses.replace(plan, status=np.int32(jm.Status.PRIMAL_INFEASIBLE))
     assert "PRIMAL_INFEASIBLE" in plot_plan(lost, mpc).get_suptitle()
     with pytest.raises(ValueError, match="plan: has states .4, 2. and inputs"):

@@ -44,7 +44,17 @@ def test_no_limits():
     assert rows_kept(None, np.zeros((2, 3))).all()
 
 
-def test_tolerance_is_relative_above_one():
+@pytest.mark.parametrize("unit", [1e-9, 1e-3, 1.0, 1e6])
+def test_what_is_kept_does_not_depend_on_the_unit(unit):
+    """A limit on both sides, and one on one side."""
+    at = TOLERANCE["float64"]
+    points = unit * np.array([[0.5 + 0.4 * at], [0.5 + 0.6 * at], [-0.5 - 0.4 * at], [-1.0]])
+    for lower, kept in ((-0.5, [True, False, True, False]), (-np.inf, [True, False, True, True])):
+        limits = jm.Box([lower * unit], [0.5 * unit])
+        np.testing.assert_array_equal(rows_kept(limits, points)[:, 0], kept)
+
+
+def test_tolerance_of_a_row_with_unequal_bounds():
     limits = jm.Box(np.array([-0.5]), np.array([150.0]))
     at = TOLERANCE["float64"]
     points = np.array([[150 * (1 + 0.9 * at)], [150 * (1 + 1.1 * at)], [-0.5 - 0.9 * at], [-0.51]])

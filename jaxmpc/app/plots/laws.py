@@ -121,9 +121,9 @@ def section(
     rest = np.delete(np.arange(len(theta)), axes)
     h = h - H[:, rest] @ theta[rest]
     corners = np.array([[frame[0, i], frame[1, j]] for i, j in ((0, 0), (1, 0), (1, 1), (0, 1))])
-    tolerance = 1e-9 * np.ptp(frame, axis=1).max()
-    for normal, offset in zip(H[:, axes], h, strict=True):
-        corners = clipped(corners, normal, offset + tolerance)
+    room = 1e-9 * np.abs(H[:, axes]) @ np.ptp(frame, axis=1)
+    for normal, offset in zip(H[:, axes], h + room, strict=True):
+        corners = clipped(corners, normal, offset)
     return corners
 
 

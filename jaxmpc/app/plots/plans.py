@@ -17,9 +17,8 @@ from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import given_blocks
 from jaxmpc.qp.linalg import float64_arrays
 from jaxmpc.qp.status import Status
-
-# What a value may be beyond its limit, of the limit, before it counts as exceeded.
-BEYOND = 1e-6
+from jaxmpc.sets.convex_sets import Box
+from jaxmpc.sets.limits import rows_kept
 
 
 def plot_plan(
@@ -89,13 +88,17 @@ def _limits_of_axes(mpc: MPC) -> list[np.ndarray]:
     for b in rows:
         low, high = b.at_steps(b.lower, N + 1, -np.inf), b.at_steps(b.upper, N + 1, np.inf)
         for found, M, other in zip(ends, (b.H, b.D), (b.D, b.H), strict=True):
-            if b.rate or b.radius is not None or M is None or (other is not None and np.any(other)):
+            if b.rate or b.radius is not None or M is None:
                 continue
-            each = np.broadcast_to(M, (len(b.steps), *M.shape[-2:]))
-            for k, of_step in zip(b.steps, each, strict=True):
-                alone = np.count_nonzero(of_step, axis=1) == 1
-                axis = np.argmax(of_step[alone] != 0, axis=1)
-                sides = np.array([low[k, alone], high[k, alone]]) / of_step[alone, axis]
+            every = M if other is None else np.concatenate([M, other], axis=-1)
+            every = np.broadcast_to(every, (len(b.steps), *every.shape[-2:]))
+            for k, row in zip(b.steps, every, strict=True):
+                # Smaller entries are rounding of the largest.
+                there = np.abs(row) > 4 * np.finfo(float).eps * np.abs(row).max(axis=1)[:, None]
+                own = there[:, : M.shape[-1]]
+                alone = (there.sum(axis=1) == 1) & own.any(axis=1)
+                axis = np.argmax(own[alone], axis=1)
+                sides = np.array([low[k, alone], high[k, alone]]) / row[alone, axis]
                 np.maximum.at(found[0, k], axis, sides.min(axis=0))
                 np.minimum.at(found[1, k], axis, sides.max(axis=0))
     return ends
@@ -123,15 +126,13 @@ def _draw(
     least, most = (every.min(), every.max()) if len(every) else (0.0, 1.0)
     room = 0.08 * (most - least) or 0.5
     least, most = least - room, most + room
-    exceeded = np.zeros(len(values), bool)
     for end, far in ((low, least), (high, most)):
         there = np.isfinite(end)
         step: Any = "post" if held else "mid"
         ax.fill_between(time, end, far, where=there, step=step, color=INFEASIBLE, lw=0, zorder=0)
         line = np.where(there, end, np.nan)
         ax.plot(time, line, drawstyle=f"steps-{step}", color=EDGE, lw=0.7, zorder=1)
-        over = values - end if far == most else end - values
-        exceeded |= there & (over > BEYOND * np.maximum(1.0, np.abs(end)))
+    exceeded = ~rows_kept(Box(low, high), values)
     ax.plot(time[exceeded], values[exceeded], ".", color=BROKEN, ms=5, zorder=4)
     if target is not None:
         ax.plot(time, target, drawstyle="steps-post" if held else "default", zorder=2, **SET_POINT)
