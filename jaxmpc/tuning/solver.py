@@ -107,11 +107,8 @@ def tune_solver(
     references = reference, input_reference
     objective = _objective(mpc, iterations, stages, groups, solver, references)
     train, test = _samples(objective.controller, x0s, warm_start, chosen)
-    given, c = replace(solver, iterations=iterations), objective.controller.condensed
-    if solver.rho is None:
-        with jax.enable_x64(True):
-            first = with_solver(objective.controller, solver).factor.rho[0, 0]
-            given = replace(given, rho=float(first))
+    given = _with_rho(objective, replace(solver, iterations=iterations))
+    c = objective.controller.condensed
     decides: dict[str, Any] = {
         "version": VERSION,
         "iterations": int(iterations),
@@ -267,6 +264,33 @@ def _objective(
     return PenaltyObjective(controller, W, tracked[0], tracked[1])
 
 
+def _with_rho(objective: "PenaltyObjective", solver: ADMM) -> ADMM:
+    """Return the solver with a number in place of rho None."""
+    if solver.rho is not None:
+        return solver
+    with jax.enable_x64(True):
+        first = with_solver(objective.controller, solver).factor.rho[0, 0]
+    return replace(solver, rho=float(first))
+
+
+def largest_residuals(
+    mpc: MPC,
+    x0s: Reals,
+    solver: ADMM,
+    reference: Reals | None = None,
+    input_reference: Reals | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the status and the largest residual, in parts of its tolerance, (B,) of plans from the
+    states x0s (B, n) by a solver without Newton steps, in float64; at most 1 of SOLVED ones."""
+    references = reference, input_reference
+    objective = _objective(mpc, solver.admm_steps(), 1, "row", solver, references)
+    solver, samples = _with_rho(objective, solver), Samples(_states(mpc, "x0s", x0s))
+    rho = np.atleast_2d(np.asarray(solver.rho))
+    rho = np.broadcast_to(rho, (len(rho), len(objective.W)))
+    with jax.enable_x64(True):
+        return solve_samples(rho, solver.alpha, objective, samples, len(samples))
+
+
 def _samples(
     controller: Controller, x0s: Reals, warm_start: Any, settings: Settings
 ) -> "tuple[Samples, Samples]":
@@ -338,25 +362,26 @@ class PenaltyObjective:
     def digits(self, theta: Any, samples: Samples) -> Array:
         """Return e (B,) of the rho and alpha of θ; see `solve`."""
         rho, alpha = jnp.exp(theta["log_rho"] @ self.W.T), 2 * jax.nn.sigmoid(theta["alpha"])
-        return self.solve(rho, alpha, samples)[1]
+        return self.solve(rho, alpha, samples)[2]
 
-    def solve(self, rho: Array, alpha: Array, samples: Samples) -> tuple[Array, Array]:
-        """Return of the plans of the samples the status (B,), and e (B,): log10 of the norm of all
-        residuals over their tolerances."""
+    def solve(self, rho: Array, alpha: Array, samples: Samples) -> tuple[Array, Array, Array]:
+        """Return of the plans of the samples the status (B,), the largest of their residuals over
+        their tolerances (B,), and e (B,): log10 of the norm of all of these."""
         solver = replace(self.controller.solver, rho=rho, alpha=alpha)
         controller, mpc = with_solver(self.controller, solver), self.controller.mpc
         n, floor = mpc.system.n, rounding(controller.dtype)
 
-        def one(sample: Samples) -> tuple[Array, Array]:
+        def one(sample: Samples) -> tuple[Array, Array, Array]:
             x, previous = sample.x[:n], sample.x[n:] if mpc.input_in_state else None
             aim = Aim(x, self.reference, self.input_reference, previous)
             plan, found = plan_with(solve_factored, controller, aim, sample.start)
             parts = stated_terms(controller, found.y, plan.states, plan.inputs, aim)
             values, sizes, terms = map(jnp.concatenate, zip(*parts, strict=True))
             allowed = solver.eps * sizes + floor * (sizes + terms)
-            squares = jnp.sum((values / jnp.where(allowed > 0, allowed, 1.0)) ** 2)
+            shares = values / jnp.where(allowed > 0, allowed, 1.0)
             # A quarter of the rounding stays, for the sake of the logarithm's slope at 0.
-            return plan.status, 0.5 * jnp.log10((floor / 4) ** 2 + squares)
+            e = 0.5 * jnp.log10((floor / 4) ** 2 + jnp.sum(shares**2))
+            return plan.status, jnp.max(jnp.abs(shares)), e
 
         return jax.vmap(one)(samples)
 
@@ -382,7 +407,8 @@ def solve_samples(
     chunk: int,
     devices: Devices = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the status and the residual over its tolerance (B,) of the samples by the solver.
+    """Return the status and the largest residual over its tolerance (B,) of the samples by the
+    solver.
 
     rho (stages, rows). chunk: samples at once; one size, so that it compiles once.
     """
@@ -405,9 +431,8 @@ def _solve_batches(devices: Devices) -> Compiled:
 def _solve_batch(
     rho: Array, alpha: Array, objective: PenaltyObjective, samples: Samples
 ) -> tuple[Array, Array]:
-    """Return status and residual over its tolerance (B,) of a batch, in JAX."""
-    status, e = objective.solve(rho, alpha, samples)
-    return status, 10.0**e
+    """Return status and largest residual over its tolerance (B,) of a batch, in JAX."""
+    return objective.solve(rho, alpha, samples)[:2]
 
 
 def score(status: np.ndarray, worst: np.ndarray) -> dict[str, float]:

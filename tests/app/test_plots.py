@@ -354,7 +354,7 @@ def test_weights_that_move_alike_stay_in_sight():
     assert len({str(line._dash_pattern) for line in lines}) == 4
 
 
-@pytest.mark.parametrize("residual", [1e-9, 1.0, np.inf, np.nan])
+@pytest.mark.parametrize("residual", [1e-3, 1.5, np.inf, np.nan])
 @pytest.mark.parametrize("count", [1, 5])
 def test_no_panel_of_the_solver_is_empty(residual, count):
     run = SimpleNamespace(
@@ -364,11 +364,11 @@ def test_no_panel_of_the_solver_is_empty(residual, count):
         },
         solver=SimpleNamespace(rho=np.full((3, 10), 0.1)),
     )
-    before, after = np.full(count, residual), np.full(count, 1e-12)
-    figure = plot_solver(run, before, after, 1e-6)
+    before, after = np.full(count, residual), np.full(count, 1e-6)
+    figure = plot_solver(run, before, after)
     require_no_empty_panel(figure)
     labels = [text.get_text() for text in figure.axes[-1].get_legend().get_texts()]
-    assert labels[0].startswith("before: 100.0 %" if residual == 1e-9 else "before: 0.0 %")
+    assert labels[0].startswith("before: 100.0 %" if residual == 1e-3 else "before: 0.0 %")
     assert labels[1].startswith("after: 100.0 %")
 
 
@@ -474,13 +474,13 @@ def test_a_plan_over_its_horizon():
     # Each row is one of its own: beside one of inputs, with rounding, and in any unit.
     for unit in (1.0, 1e-7):
         C, D = [[1, 5.6e-17], [0, 0]], [[0], [1]]
-        soft = jm.Soft(C, upper=np.array([0.5 * unit, 9]), D=D, rho=2.0, stages=(2, 3))
+        soft = jm.Soft(C, upper=np.array([0.5 * unit, 9]), D=D, rho=2.0, stages=(2,))
         scaled = dataclasses.replace(plan, states=x * unit)
         changed = dataclasses.replace(mpc, states=None, outputs=(), soft=(soft,))
         ax = plot_plan(scaled, changed).axes[0]
-        np.testing.assert_allclose(ax.lines[2].get_ydata()[2:], 0.5 * unit)
+        assert ax.lines[2].get_ydata()[2] == pytest.approx(0.5 * unit)
         red = [line for line in ax.lines if line.get_color() == BROKEN]
-        np.testing.assert_array_equal(red[0].get_ydata(), unit * x[2:, 0][x[2:, 0] > 0.5])
+        np.testing.assert_array_equal(red[0].get_ydata(), unit * x[2:3, 0])
     lost = dataclasses.replace(plan, status=np.int32(jm.Status.PRIMAL_INFEASIBLE))
     assert "PRIMAL_INFEASIBLE" in plot_plan(lost, mpc).get_suptitle()
     with pytest.raises(ValueError, match="plan: has states .4, 2. and inputs"):

@@ -237,7 +237,7 @@ def test_refuses(learn, words):
 def test_refuses_other_parameters(layer):
     for wrong in (None, np.zeros(3), jnp.zeros(2)):
         with pytest.raises(
-            ValueError, match="theta: is a .* Give a dict of arrays, as from init()"
+            ValueError, match="theta: is an? .* Give a dict of arrays, as from init()"
         ):
             layer(wrong, np.zeros(2))
     with pytest.raises(ValueError, match="theta: has the names Q"):

@@ -364,10 +364,17 @@ def test_the_picture_has_residuals_of_the_default():
         ADMM(iterations=20, newton_steps=0, rho=0.3),
     )
     states = np.array([[0.1, 0.2], [-0.3, 0.1]])
-    worst = tune_solver.largest_residuals(mpc, states, (given, other))
+    worst = tune_solver.residuals_of_feasible(mpc, states, (given, other))
     assert np.all(np.isfinite(worst))
+    # In parts of their tolerance, they are at most 1 where the table says solved.
+    many = np.random.default_rng(0).uniform(-0.4, 0.4, (40, 2))
+    status, parts = jm.tuning.solver.largest_residuals(mpc, many, given)
+    np.testing.assert_array_equal(parts <= 1, status == jm.Status.SOLVED)
+    assert 0 < np.mean(parts <= 1) < 1
     own = replace(given, rho=float(jm.Controller(mpc, given).factor.rho[0, 0]))
-    same = tune_solver.largest_residuals(mpc, states, (own, other))
+    same = tune_solver.residuals_of_feasible(mpc, states, (own, other))
     np.testing.assert_allclose(same, worst, rtol=1e-3, atol=1e-9)
-    aimed = tune_solver.largest_residuals(mpc, states, (own, other), reference=np.array([9.0, 0]))
+    aimed = tune_solver.residuals_of_feasible(
+        mpc, states, (own, other), reference=np.array([9.0, 0])
+    )
     assert np.abs(np.log(aimed / worst)).max() > 0.1

@@ -7,7 +7,6 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
 from jaxmpc.app import config as configs
@@ -21,13 +20,12 @@ from jaxmpc.app.plots.style import save
 from jaxmpc.app.plots.tuning import plot_solver
 from jaxmpc.checks import fail
 from jaxmpc.files import as_json, versions, write_json
-from jaxmpc.mpc.controller import solve
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.tightening import require_tightened
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status
 from jaxmpc.tuning.result import CHECKPOINT, TuningRun, run_folder
-from jaxmpc.tuning.solver import SOLVER, tune_solver
+from jaxmpc.tuning.solver import SOLVER, largest_residuals, tune_solver
 from jaxmpc.tuning.tasks import feasible_states, initial_range
 
 FILES = ("solver.json", TUNED, "solver.png")
@@ -83,7 +81,7 @@ class TuneSolver(TuneSolverOptions):
             )
         seconds = time.perf_counter() - learning
         given = dataclasses.replace(SOLVER, iterations=self.iterations)
-        worst = largest_residuals(mpc, test, (given, run.solver), **config.references())
+        worst = residuals_of_feasible(mpc, test, (given, run.solver), **config.references())
         infeasible = without_plan + round(run.after["infeasible"])
         save_run(self.output, config, run, options, worst, infeasible, seconds)
         rows = [
@@ -117,8 +115,9 @@ def save_run(
 ) -> None:
     """Write tuned.toml, solver.json and solver.png.
 
-    worst (2, B): the largest residual of the validation states with the solver given and the one
-    found. infeasible: number of states drawn that have no plan. seconds: of learning.
+    worst (2, B): the largest residual of the validation states, over its tolerance, with the solver
+    given and the one found. infeasible: number of states drawn that have no plan. seconds: of
+    learning.
     """
     h, rho, alpha = run.history, *penalties(run)
     solver = configs.SolverSection(
@@ -147,7 +146,7 @@ def save_run(
     write_json(folder / FILES[0], document)
     words = "tuned" if run.improved else "default kept, no step is better"
     title = f"{config.name}: {solver.iterations} ADMM steps, {words}"
-    save(plot_solver(run, worst[0], worst[1], 1e-6, title), folder / "solver.png")
+    save(plot_solver(run, worst[0], worst[1], title), folder / "solver.png")
 
 
 def solver_rows(run: TuningRun, states: int, infeasible: int) -> list[tuple[str, str]]:
@@ -161,7 +160,7 @@ def solver_rows(run: TuningRun, states: int, infeasible: int) -> list[tuple[str,
         ("solved", two_columns(solved, f"of {states} states")),
         ("residual", two_columns(residual, "median, of its tolerance")),
         ("rho", two_columns((f"{run.settings['given_rho']:.3g}", spread))),
-        ("alpha", two_columns(("1.6", f"{alpha:.4g}"))),
+        ("alpha", two_columns((f"{float(run.initial['alpha']):.4g}", f"{alpha:.4g}"))),
         ("infeasible", f"{infeasible:,} states drawn have no plan: left out"),
     ]
 
@@ -171,14 +170,11 @@ def penalties(run: TuningRun) -> tuple[np.ndarray, float]:
     return np.asarray(run.solver.rho, float), float(np.asarray(run.solver.alpha))
 
 
-def largest_residuals(
+def residuals_of_feasible(
     mpc: MPC, states: np.ndarray, solvers: tuple[ADMM, ADMM], **references: Any
 ) -> np.ndarray:
-    """Return the largest residual (2, B) with each solver, of the states that neither proves
-    infeasible. references: as in `solve`."""
-    with jax.enable_x64(True):
-        each = jax.jit(lambda s: jax.vmap(lambda x: solve(mpc, x, solver=s, **references))(states))
-        plans = [jax.tree.map(np.asarray, each(solver)) for solver in solvers]
-    worst = [np.max([p.primal_residual, p.dual_residual, np.abs(p.gap)], axis=0) for p in plans]
-    feasible = np.all([p.status != Status.PRIMAL_INFEASIBLE for p in plans], axis=0)
-    return np.array(worst)[:, feasible]
+    """Return the largest residual over its tolerance (2, B) with each solver, of the states that
+    neither proves infeasible. references: as in `solve`."""
+    found = [largest_residuals(mpc, states, solver, **references) for solver in solvers]
+    feasible = np.all([status != Status.PRIMAL_INFEASIBLE for status, _ in found], axis=0)
+    return np.array([worst for _, worst in found])[:, feasible]

@@ -27,7 +27,7 @@ class TuneSolverOptions:
       initial states, runs the steps, and moves rho and alpha down the gradient of the number of
       digits by which the residuals are too large. Some of the states (--validation) are the
       validation set: the result is the best of all steps on these; where none is better than the
-      default (one rho, by the numbers of inputs and rows, alpha = 1.6) the table says so and the
+      default (one rho, by the numbers of inputs and rows, alpha = 1.9) the table says so and the
       default is kept.
       ADMM converges to the same plan for every rho: a bad rho costs steps, not correctness.
       Without a file the problem is one robot joint: x = (q, dq), torque u, 20 steps of 0.01 s.

@@ -251,13 +251,11 @@ def plot_maps(before: FeasibleSetMap, after: FeasibleSetMap) -> Figure:
     return figure
 
 
-def plot_solver(
-    run: TuningRun, before: np.ndarray, after: np.ndarray, eps: float, title: str = ""
-) -> Figure:
+def plot_solver(run: TuningRun, before: np.ndarray, after: np.ndarray, title: str = "") -> Figure:
     """Draw the penalties of `tune_solver` by kind of row and stage, and the residuals.
 
-    run: of `tune_solver`. before, after (B,): largest residual of each validation state with the
-    solver that was given and with the tuned one. eps: what counts as solved. Rows of a kind are
+    run: of `tune_solver`. before, after (B,): largest residual of each validation state, in parts
+    of its tolerance, with the solver that was given and with the tuned one. Rows of a kind are
     drawn over the step k of the horizon at which they hold, those of one step by their number.
     """
     blocks = [block for block in run.settings["blocks"] if block[2] and block[1]]
@@ -301,26 +299,26 @@ def plot_solver(
     ]
     figure.legend(handles=stages, loc="outside lower left", ncols=8, fontsize=8, frameon=False)
     last, count = axes[-1], max(len(before), 1)
-    both = np.concatenate([before, after, [eps]])
+    both = np.concatenate([before, after, [1.0]])
     both = np.maximum(both[np.isfinite(both)], 1e-17)
     left, right = 0.5 * both.min(), 2 * both.max()
     for values, name, colour in ((before, "before", BEFORE), (after, "after", AFTER)):
         # What is not finite stays unsolved, at the right end.
         values = np.sort(values[np.isfinite(values)])
         fraction = 100 * np.arange(1, len(values) + 1) / count
-        solved = 100 * np.count_nonzero(values <= eps) / count
+        solved = 100 * np.count_nonzero(values <= 1) / count
         last.step(
             np.concatenate([[left], np.maximum(values, left), [right]]),
             np.concatenate([[0.0], fraction, fraction[-1:] if len(fraction) else [0.0]]),
             where="post",
             color=colour,
             lw=1.6,
-            label=f"{name}: {solved:.1f} % ≤ {eps:g}",
+            label=f"{name}: {solved:.1f} % solved",
         )
-    last.axvline(eps, color=EDGE, lw=0.9, ls=(0, (4, 2)))
+    last.axvline(1.0, color=EDGE, lw=0.9, ls=(0, (4, 2)))
     last.set_xscale("log")
     last.set_ylim(0, 103)
-    last.set_xlabel("largest residual")
+    last.set_xlabel("largest residual / tolerance")
     last.set_ylabel("fraction of validation states [%]")
     last.grid(**GRID)
     last.set_axisbelow(True)
