@@ -249,10 +249,10 @@ class Polytope(LinearSet):
     def is_empty(self) -> bool:
         """Return whether no point satisfies all rows: whether an LP finds multipliers y >= 0 with
         G'y = 0 and g'y < 0, by more than rounding (1e-11 of the terms)."""
-        H, h = self.half_spaces()
-        if np.any((h == -np.inf) | (~H.any(axis=1) & (h < 0))):
+        try:
+            return Program(*self.unit_rows()).empty
+        except Empty:
             return True
-        return Program(*geometry.unit_rows(H, h)).empty
 
     def is_bounded(self) -> bool:
         """Return whether the set is bounded, by LPs whose answer is checked; an empty one is."""
@@ -574,11 +574,10 @@ class Polytope(LinearSet):
 
     def _hull(self) -> AffineHull | None:
         """Return the affine hull and the set in its coordinates; None if it is empty."""
-        self._require_fields("Polytope")
-        H, h = self.half_spaces()
-        if np.any((h == -np.inf) | (~H.any(axis=1) & (h < 0))):
+        try:
+            return polyhedra.full_part(*self.unit_rows())
+        except Empty:
             return None
-        return polyhedra.full_part(*geometry.unit_rows(H, h))
 
     def _keeps(self, rows: np.ndarray, offsets: np.ndarray, tolerance: float) -> bool:
         program = Program(*self.unit_rows())
