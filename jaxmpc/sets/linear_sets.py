@@ -319,7 +319,7 @@ class Polytope(LinearSet):
         """Return the smallest box around it, by two LPs a coordinate; infinite bounds where it is
         unbounded, an empty box if it is empty."""
         if self.is_empty():
-            return Box(np.full(self.dimension, np.inf), np.full(self.dimension, -np.inf))
+            return _empty_box(self.dimension)
         return Box(*Program(*self.unit_rows()).bounds())
 
     def to_polytope(self) -> "Polytope":
@@ -763,7 +763,7 @@ class Box(LinearSet):
             other = other.spread(self.dimension)
             other._require_fields("other", self.dimension)
             if self.is_empty() or other.is_empty():
-                return Box(np.full(self.dimension, np.inf), np.full(self.dimension, -np.inf))
+                return _empty_box(self.dimension)
             (lower, upper), (lower_too, upper_too) = self._ends(), other._ends()
             return Box(lower + lower_too, upper + upper_too)
         if isinstance(other, Zonotope) and self.is_bounded() and not self.is_empty():
@@ -821,7 +821,7 @@ class Box(LinearSet):
         lower, upper = self._ends()
         axes = chosen_axes(axes, len(lower))
         if _misses(lower, upper).any():
-            return Box(np.full(len(axes), np.inf), np.full(len(axes), -np.inf))
+            return _empty_box(len(axes))
         return Box(lower[axes], upper[axes])
 
     def slice(self, values: Mapping[int, float]) -> "Box":
@@ -831,7 +831,7 @@ class Box(LinearSet):
         fixed, at, rest = section(values, len(lower))
         inside = np.all((lower[fixed] <= at) & (at <= upper[fixed]))
         if not inside or _misses(lower, upper).any():
-            return Box(np.full(len(rest), np.inf), np.full(len(rest), -np.inf))
+            return _empty_box(len(rest))
         return Box(lower[rest], upper[rest])
 
     def cartesian_product(self, other: LinearSet) -> LinearSet:
@@ -898,16 +898,18 @@ class Box(LinearSet):
             self.validate("Box")
         return lower, upper
 
-    def _checked_bounds(self) -> tuple[np.ndarray, np.ndarray]:
+    def _finite_bounds(self) -> tuple[np.ndarray, np.ndarray]:
         self = self.spread(1)
         self.validate("Box")
-        return self.bounds()
-
-    def _finite_bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        lower, upper = self._checked_bounds()
+        lower, upper = self.bounds()
         if not np.isfinite([lower, upper]).all():
             fail("Box", "is unbounded", "Give finite bounds in every coordinate")
         return lower, upper
+
+
+def _empty_box(n: int) -> Box:
+    """Return an empty set in R^n as a Box."""
+    return Box(np.full(n, np.inf), np.full(n, -np.inf))
 
 
 def _misses(lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
@@ -990,8 +992,7 @@ class Zonotope(LinearSet):
         if isinstance(other, LinearSet):
             other = other.spread(n)
             other._require_fields("other", n)
-        if isinstance(other, Box) and other.is_bounded() and not other.is_empty():
-            other = other.to_zonotope()
+        other = _by_generators(other)
         if isinstance(other, Zonotope):
             center_too, G_too = other._values()
             return Zonotope(center + center_too, np.hstack([G, G_too]))
@@ -1044,8 +1045,7 @@ class Zonotope(LinearSet):
     def cartesian_product(self, other: LinearSet) -> LinearSet:
         """Return {(x, y) : x in the set, y in other}: a Zonotope with a Zonotope or a bounded Box,
         else a Polytope."""
-        if isinstance(other, Box) and other.is_bounded() and not other.is_empty():
-            other = other.to_zonotope()
+        other = _by_generators(other)
         if not isinstance(other, Zonotope):
             return self.to_polytope().cartesian_product(other)
         (center, G), (center_too, G_too) = self._values(), other._values()
@@ -1088,6 +1088,12 @@ class Zonotope(LinearSet):
             wanted = f"({center[0]}, m)"
             fail(f"{argument}.generators", f"shape {G} is not {wanted}", "Give one a column")
         require_dimension(argument, center[0], dimension)
+
+
+def _by_generators(value: Any) -> Any:
+    """Return a bounded Box that is not empty as a Zonotope, anything else as it is."""
+    bounded = isinstance(value, Box) and value.is_bounded() and not value.is_empty()
+    return value.to_zonotope() if bounded else value
 
 
 def _require_summand(set_: ConvexSet, other: Any) -> None:
