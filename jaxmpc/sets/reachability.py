@@ -5,7 +5,7 @@ from typing import Literal
 import numpy as np
 
 from jaxmpc.checks import fail, require_kind, whole
-from jaxmpc.sets.convex_sets import Box, LinearSet, Polytope, as_polytope
+from jaxmpc.sets.convex_sets import LinearSet, Polytope, as_polytope
 from jaxmpc.sets.predecessors import one_step
 from jaxmpc.systems.system import LinearSystem, host_matrices
 
@@ -84,20 +84,15 @@ def _forward(
     U, W = _checked("inputs", inputs, system.m), _checked("disturbance", disturbance, system.n)
     X = _checked("states", states, system.n)
     everything = Polytope(np.zeros((0, system.m)), np.zeros(0))
-    added = _exact(everything if U is None else U).image(B, c)
-    added = added if W is None else added + _exact(W)
-    found, last = [first], _exact(first)
+    added = (everything if U is None else U).image(B, c)
+    added = added if W is None else added + W
+    found, last = [first], first
     for _ in range(steps):
         last = last.image(A) + added
         last = last if X is None else last & X
         last = last.reduce() if isinstance(last, Polytope) else last
         found.append(last)
     return tuple(found)
-
-
-def _exact(set_: LinearSet) -> LinearSet:
-    """Return a bounded box as a Zonotope, any other set as it is."""
-    return set_.to_zonotope() if isinstance(set_, Box) and set_.is_bounded() else set_
 
 
 def _backward(
