@@ -89,7 +89,7 @@ def check_candidates(
         )
         infeasible = infeasible | here
     normal, offset = proofs.everywhere(p, normal, offset, slope)
-    offset = jnp.where(proofs.excludes(normal, offset, zero, theta), offset, jnp.inf)
+    offset = proofs.offset_at(normal, offset, theta)
     label = jnp.where(feasible, 1, jnp.where(infeasible, -1, 0)).astype(jnp.int8)
     return Verdict(label, p.view.initial_state(theta, free), inputs, normal, offset)
 

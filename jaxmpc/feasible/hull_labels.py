@@ -108,9 +108,13 @@ def edges_of(values: np.ndarray, facets: np.ndarray) -> np.ndarray:
     return (values[:-1] - values[-1])[facets].transpose(0, 2, 1)
 
 
-def largest_row_sum(matrices: np.ndarray) -> np.ndarray:
-    """Return the maximum norm (F,) of matrices (F, d, d)."""
-    return np.abs(matrices).sum(axis=2).max(axis=1)
+def rounding_of_cones(edges: np.ndarray, M: np.ndarray) -> np.ndarray:
+    """Return by how much λ = M (θ − c) may be off in each cone (F,), with its edges E (F, d, d) and
+    γ of `proofs.gamma`: four times ‖I − M E‖ + O(γ) ‖|M||E|‖, which bounds it in the hull."""
+    d = M.shape[1]
+    norm = lambda matrices: np.abs(matrices).sum(axis=2).max(axis=1)
+    size = norm(np.abs(M) @ np.abs(edges))
+    return 4 * (norm(np.eye(d) - M @ edges) + 4 * proofs.gamma(d + 3) * size)
 
 
 def label_limits(
@@ -120,14 +124,11 @@ def label_limits(
     (top of this file); a gauge of −∞ for none: with free states, equalities or a terminal
     ellipsoid, whose plans are rolled out.
 
-    points (K + 1, d), the centre last, with inputs values (K + 1, v). With E the edges and γ of
-    `proofs.gamma`, λ is off by no more than ‖I − M E‖ + O(γ) ‖|M||E|‖ in the hull, four times which
-    is allowed for; and inputs by d max|u_i − u_c| times that, in `roll_out` as `moved`.
+    points (K + 1, d), the centre last, with inputs values (K + 1, v). Where λ is off by
+    `rounding_of_cones`, inputs are by d max|u_i − u_c| times that, in `roll_out` as `moved`.
     """
     d, N, (_, m) = points.shape[1], p.horizon, p.sizes
-    edges = edges_of(points, facets)
-    size = largest_row_sum(np.abs(M) @ np.abs(edges))
-    off = 4 * (largest_row_sum(np.eye(d) - M @ edges) + 4 * proofs.gamma(d + 3) * size)
+    off = rounding_of_cones(edges_of(points, facets), M)
     none = np.full(len(off), -np.inf)
     if values.shape[1] != N * m or p.equalities is not None or p.P is not None:
         return off, none
@@ -202,7 +203,11 @@ def compiled_verdicts(devices: Devices) -> Compiled:
 
 def label(hull: Hull, theta: Array) -> Array:
     """Return the label of θ (d,), 0 where it is left to others: nothing is rolled out."""
-    cone, facet = nearest_cone(hull, theta)
+    return label_in(hull, theta, *nearest_cone(hull, theta))
+
+
+def label_in(hull: Hull, theta: Array, cone: Array, facet: Array) -> Array:
+    """Return the label that this cone and this half-space give θ (d,)."""
     share = jnp.sum(hull.M[cone] * (theta - hull.center), axis=1)
     inside = jnp.all(share >= hull.least[cone]) & (jnp.sum(share) <= hull.most[cone])
     a, b, w = (v[facet] for v in hull.cuts)
@@ -220,10 +225,9 @@ def verdict(p: ExactData, hull: Hull, theta: Array) -> proofs.Verdict:
     # The cut at the point rests on no linear program; a half-space may (`proofs.everywhere`).
     a, b, w = (v[facet] for v in hull.cuts)
     infeasible = proofs.excludes(a, b, w, theta)
-    normal, offset = hull.normals[facet], hull.offsets[facet]
-    everywhere = proofs.excludes(normal, offset, jnp.zeros_like(normal), theta)
-    offset = jnp.where(everywhere, offset, jnp.inf)
     label = jnp.where(feasible, 1, jnp.where(infeasible, -1, 0)).astype(jnp.int8)
+    normal = hull.normals[facet]
+    offset = proofs.offset_at(normal, hull.offsets[facet], theta)
     return proofs.Verdict(label, p.view.initial_state(theta, free), inputs, normal, offset)
 
 

@@ -46,7 +46,8 @@ from jaxmpc.feasible.hull_labels import (
     edges_of,
     exceeded_most,
     hull_facets,
-    largest_row_sum,
+    label_in,
+    rounding_of_cones,
 )
 from jaxmpc.feasible.pipeline import (
     MOST_PROGRAMS,
@@ -226,10 +227,7 @@ class PolicyHull:
         theta, w = np.vstack([bounds.points, rays.center]), np.vstack([bounds.w, rays.w])
         facets = facets[np.linalg.cond(edges_of(theta, facets) / unit[:, None]) < 1e8]
         M = np.linalg.inv(edges_of(theta, facets))
-        # λ is off by no more than this (see `hull_labels.label_limits`); real λ are all it takes.
-        edges = edges_of(theta, facets)
-        size = largest_row_sum(np.abs(M) @ np.abs(edges))
-        off = 4 * (largest_row_sum(np.eye(d) - M @ edges) + 4 * proofs.gamma(d + 3) * size)
+        off = rounding_of_cones(edges_of(theta, facets), M)  # real λ are all it takes
         gauge, slope = M.sum(axis=1), edges_of(w, facets) @ M
         _, _, normals, offsets, cuts = bounds
         least = off, 1 - d * off
@@ -278,11 +276,7 @@ class PolicyHull:
 def label(hull: Hull, theta: Array) -> tuple[Array, Array, Array]:
     """Return the label of θ (d,), 0 where it is left to a ray, its cone, and its half-space."""
     cone, facet = holding_cone(hull, theta), exceeded_most(hull, theta)
-    share = jnp.sum(hull.M[cone] * (theta - hull.center), axis=1)
-    inside = jnp.all(share >= hull.least[cone]) & (jnp.sum(share) <= hull.most[cone])
-    a, b, w = (v[facet] for v in hull.cuts)
-    outside = proofs.excludes(a, b, w, theta)
-    return jnp.where(inside, 1, jnp.where(outside, -1, 0)).astype(jnp.int8), cone, facet
+    return label_in(hull, theta, cone, facet), cone, facet
 
 
 def holding_cone(hull: Hull, theta: Array) -> Array:
@@ -404,9 +398,9 @@ def compiled_proofs(devices: Devices) -> Compiled:
     def one(hull: Hull, theta: Array) -> tuple[Array, ...]:
         found, cone, facet = label(hull, theta)
         value = hull.value + jnp.sum(hull.slope[cone] * (theta - hull.center), axis=1)
-        normal, offset = hull.normals[facet], hull.offsets[facet]
-        beyond = proofs.excludes(normal, offset, jnp.zeros_like(normal), theta)
-        return value, found, cone, normal, jnp.where(beyond, offset, jnp.inf)
+        normal = hull.normals[facet]
+        offset = proofs.offset_at(normal, hull.offsets[facet], theta)
+        return value, found, cone, normal, offset
 
     return over_devices(jax.vmap(one, in_axes=(None, 0)), devices, (False, True))
 

@@ -271,3 +271,8 @@ def excludes(a: Array, b: Array, w: Array, theta: Array) -> Array:
     beyond = jnp.sum(a * theta, axis=-1) - jnp.sum(w * jnp.abs(theta), axis=-1) - b
     size = jnp.sum((jnp.abs(a) + w) * jnp.abs(theta), axis=-1) + jnp.abs(b)
     return beyond > 2 * gamma(2 * theta.shape[-1] + 3) * size
+
+
+def offset_at(normal: Array, offset: Array, theta: Array) -> Array:
+    """Return the offset of a half-space that excludes θ (d,) by itself, ∞ of another one."""
+    return jnp.where(excludes(normal, offset, jnp.zeros_like(normal), theta), offset, jnp.inf)
