@@ -38,7 +38,12 @@ from jaxmpc.feasible.hard_constraints import Axes, augmented_dynamics, hard_bloc
 from jaxmpc.feasible.plan_polytope import PlanPolytope
 from jaxmpc.feasible.problem import FeasibilityProblem, as_box
 from jaxmpc.feasible.proofs import Cut
-from jaxmpc.mpc.policy_rows import require_free_inputs, require_generators, tube_section
+from jaxmpc.mpc.policy_rows import (
+    causal_entries,
+    require_free_inputs,
+    require_generators,
+    tube_section,
+)
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.tightening import feedback_gain, without_disturbance
 from jaxmpc.pytrees import record
@@ -130,8 +135,7 @@ class PolicyProblem(FeasibilityProblem):
         N, m = self.mpc.horizon, self.mpc.system.m
         if self.mpc.policy == "tube":
             return np.zeros((0, 0), bool)
-        g = directions(self.mpc)[1].shape[1]
-        return np.kron(np.tril(np.ones((N, N)), -1), np.ones((m, g))) > 0
+        return causal_entries(N, m, directions(self.mpc)[1].shape[1])
 
     @cached_property
     def lifted(self) -> "Lifted":

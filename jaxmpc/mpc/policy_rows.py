@@ -125,7 +125,7 @@ class PolicyCondensed(Condensed):
         if base is None:
             return None
         N, m, Np = base.shape
-        entries, first = causal_entries(N, m, Np // N), len(self.begins) * m
+        entries, first = np.argwhere(causal_entries(N, m, Np // N)), len(self.begins) * m
         M = jnp.zeros((N * m, Np), z.dtype)
         M = M.at[tuple(entries.T)].set(z[first : first + len(entries)])
         found = base + matmul(self.of_answers, M)
@@ -196,9 +196,8 @@ def tube_section(mpc: MPC) -> Zonotope:
 
 
 def causal_entries(N: int, m: int, p: int) -> np.ndarray:
-    """Return the places (L, 2) of the entries of M (N m, N p) that answer to earlier
-    disturbances."""
-    return np.argwhere(np.kron(np.tril(np.ones((N, N)), -1), np.ones((m, p))) > 0)
+    """Return which entries (N m, N p) of M answer to earlier disturbances."""
+    return np.kron(np.tril(np.ones((N, N)), -1), np.ones((m, p))) > 0
 
 
 def affine_bytes(mpc: MPC, found: Sequence[Block]) -> float:
@@ -208,7 +207,7 @@ def affine_bytes(mpc: MPC, found: Sequence[Block]) -> float:
     W: Any = mpc.disturbance
     generators = p if isinstance(W, Box) else np.shape(W.generators)[1]
     T = int(np.sum(np.maximum(step - ~moved, 0))) * generators
-    variables = N * m + len(causal_entries(N, m, p)) + T
+    variables = N * m + np.count_nonzero(causal_entries(N, m, p)) + T
     return 8.0 * MATRICES * (2 * len(step) + 2 * T + variables) ** 2
 
 
@@ -301,7 +300,7 @@ def _affine(nominal: Condensed, each: Condensed, mpc: MPC) -> PolicyCondensed:
     row, at, generator = np.nonzero(
         np.broadcast_to((j < last[:, None])[..., None], (*D.shape[:2], g))
     )
-    places = causal_entries(N, m, p)
+    places = np.argwhere(causal_entries(N, m, p))
     inputs, disturbed, coordinate = places[:, 0], places[:, 1] // p, places[:, 1] % p
 
     reach = matmul(D, Gamma)
