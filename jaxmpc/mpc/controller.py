@@ -55,7 +55,7 @@ from jaxmpc.mpc.plan import (
 )
 from jaxmpc.mpc.policy_rows import MATRICES, PolicyCondensed, condensed_plan
 from jaxmpc.mpc.problem import MPC, at_stage, dynamics_of
-from jaxmpc.mpc.rows import blocks, dynamics_terms, given_blocks, split
+from jaxmpc.mpc.rows import blocks, dynamics_terms, given_blocks, row_values, split
 from jaxmpc.mpc.tightening import with_gain
 from jaxmpc.pytrees import prepared_pytree
 from jaxmpc.qp.admm import ADMM, DEFAULT, Factor
@@ -418,15 +418,14 @@ def _qp(controller: Controller, theta: Array, aim: Aim) -> QP:
     if aim.forecast is None:
         return c.qp(theta, aim.states, aim.inputs)
     x, u = c.response(mpc.system, aim.forecast)
-    rates = jnp.diff(u, axis=0, prepend=jnp.zeros_like(u[:1]))
-    along = [b.values(x, rates if b.rate else u).ravel() for b in given_blocks(mpc, x.dtype)]
-    shift = jnp.concatenate([*along, x[0, :0]])
+    none = jnp.zeros_like(u[0])
+    shift = row_values(given_blocks(mpc, x.dtype), x, u, none)
     states, inputs = (0.0 if r is None else r for r in (aim.states, aim.inputs))
     shift = c.of_all(shift) if isinstance(c, PolicyCondensed) else shift
     qp = c.qp(theta, states - x, inputs - u, shift)
     if mpc.input_rate_weight is None:
         return qp
-    push = _of_rates(2 * apply(c.weights.W, rates))
+    push = _of_rates(2 * apply(c.weights.W, jnp.diff(u, axis=0, prepend=none[None])))
     return replace(qp, q=qp.q + jnp.einsum("kmi,km->i", c.Omega, push, precision="highest"))
 
 

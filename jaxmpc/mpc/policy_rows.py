@@ -39,7 +39,7 @@ from jax.typing import DTypeLike
 from jaxmpc.checks import concrete, fail, require_memory
 from jaxmpc.mpc.condense import Condensed, condense
 from jaxmpc.mpc.problem import MPC, dynamics_of
-from jaxmpc.mpc.rows import Block, given_blocks, row_count
+from jaxmpc.mpc.rows import Block, given_blocks, row_count, row_values
 from jaxmpc.mpc.tightening import feedback_gain, require_room, without_disturbance
 from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.admm import ADMM, SPLIT, Factor, factorise
@@ -218,14 +218,6 @@ def _row_steps(found: Sequence[Block]) -> tuple[np.ndarray, np.ndarray]:
     return step.astype(int), np.concatenate([np.zeros(0, bool), *moved])
 
 
-def _values(found: Sequence[Block], x: Array, u: Array) -> Array:
-    """Return the rows (rows,) of states x (N+1, n) and inputs u (N, m), the input before the first
-    being the same as the first."""
-    rates = jnp.diff(u, axis=0, prepend=u[:1])
-    values = [b.values(x, rates if b.rate else u).ravel() for b in found]
-    return jnp.concatenate([*values, x[0, :0]])
-
-
 def generator_form(W: Any, dtype: DTypeLike) -> tuple[Array, Array]:
     """Return center (p,) and Γ (p, g) of w = center + Γ ω, |ω_i| ≤ 1."""
     if isinstance(W, Box):
@@ -291,7 +283,7 @@ def _affine(nominal: Condensed, each: Condensed, mpc: MPC) -> PolicyCondensed:
     # Row (j, q): what w_j = e_q alone adds.
     pushes = jnp.einsum("jk,nq->jqkn", jnp.eye(N, dtype=dtype), E).reshape(N * p, N, n)
     x, u = jax.vmap(lambda e: nominal.response(mpc.system, e))(pushes)
-    D = jax.vmap(lambda x, u: _values(found, x, u))(x, u).T.reshape(-1, N, p)
+    D = jax.vmap(lambda x, u: row_values(found, x, u, u[0]))(x, u).T.reshape(-1, N, p)
     G = nominal.C
 
     step, moved = _row_steps(found)
@@ -417,7 +409,8 @@ def _tube(nominal: Condensed, mpc: MPC, gain: Array, section: Zonotope) -> Polic
 
     def along(e: Array) -> Array:
         x = responses(e)
-        return _values(found, x, matmul(x[:-1], K.T))
+        u = matmul(x[:-1], K.T)
+        return row_values(found, x, u, u[0])
 
     center, generators = (jnp.asarray(v, dtype) for v in (section.center, section.generators))
     moves = jax.vmap(along)(generators.T).T

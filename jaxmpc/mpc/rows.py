@@ -322,6 +322,14 @@ def _each(H: Array, M: Array) -> Array:
     return matmul(H, M) if M.ndim == 3 else apply(H, M)
 
 
+def row_values(found: Iterable[Block], x: Array, u: Array, before: Array) -> Array:
+    """Return the rows (rows,) of states x (N+1, n) and inputs u (N, m), after the input `before`
+    (m,)."""
+    rates = jnp.diff(u, axis=0, prepend=before[None])
+    values = [b.values(x, rates if b.rate else u).ravel() for b in found]
+    return jnp.concatenate([*values, x[0, :0]])
+
+
 def layout(mpc: MPC) -> Layout:
     """Return (kind, steps, rows a step) of each block of rows."""
     return layout_of(given_blocks(mpc, float))
