@@ -6,6 +6,7 @@ label depends on their numbers; proofs use `ExactData`.
 
 import contextlib
 import threading
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -361,9 +362,6 @@ class RowPrograms:
         """Return bounds (2, d) of every feasible θ, lower and upper, infinite where none is found,
         None where the set is found empty; and the multipliers (2d, R) of the upper and then the
         lower sides.
-
-        Each side is moved out by the larger of the coordinate's two finite ends, which outweighs
-        the tolerances of the linear programs.
         """
         d, programs = self.rows.D.shape[1], RowPrograms(self.rows)
         directions = np.concatenate([np.eye(d), -np.eye(d)])
@@ -377,11 +375,7 @@ class RowPrograms:
 
         # Programs of their own, so that no tangent comes from an earlier question.
         ends, y = zip(*map(end, directions), strict=True)
-        if -np.inf in ends:
-            return None, np.array(y)
-        ends = np.reshape(ends, (2, d))
-        margin = np.where(np.isfinite(ends), np.abs(ends), 0.0).max(axis=0) + 1e-300
-        return np.array([-ends[1] - margin, ends[0] + margin]), np.array(y)
+        return moved_out(ends), np.array(y)
 
     def center(self, given: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Return θ (the one given, or the best) and w with the largest common margin of all rows,
@@ -407,6 +401,18 @@ class RowPrograms:
         empty, flat = "is empty: no initial state has a plan", "is flat: no initial state keeps"
         what = empty if t < -FLAT else f"{flat} a margin"
         fail("mpc", f"its feasible set {what}", RELAX)
+
+
+def moved_out(ends: Sequence[float]) -> np.ndarray | None:
+    """Return bounds (2, d) from the maxima of θ_i and then of −θ_i (2d,); None for an empty set.
+
+    Each side is moved out by the larger of the coordinate's two finite ends, which outweighs the
+    tolerances of the linear programs."""
+    if -np.inf in ends:
+        return None
+    sides = np.reshape(ends, (2, -1))
+    margin = np.where(np.isfinite(sides), np.abs(sides), 0.0).max(axis=0) + 1e-300
+    return np.array([-sides[1] - margin, sides[0] + margin])
 
 
 def outward(rows: ConstraintRows, inputs: Any) -> np.ndarray:

@@ -34,6 +34,7 @@ import numpy as np
 
 from jaxmpc.arrays import Reals, fractions_of
 from jaxmpc.checks import fail, require_kind
+from jaxmpc.feasible.condensed_rows import moved_out
 from jaxmpc.feasible.hard_constraints import Axes, augmented_dynamics, hard_blocks, make_view
 from jaxmpc.feasible.plan_polytope import PlanPolytope
 from jaxmpc.feasible.problem import FeasibilityProblem, as_box
@@ -477,11 +478,7 @@ class PolicyPrograms:
             top = self.whole.maximise(np.append(row, np.zeros(self.lifted.rows.shape[1] - d)))
             ends.append(top.value)
             y.append(np.zeros(len(self.lifted.rows)) if top.y is None else top.y)
-        if -np.inf in ends:
-            return None, np.array(y)
-        sides = np.reshape(ends, (2, d))
-        margin = np.where(np.isfinite(sides), np.abs(sides), 0.0).max(axis=0) + 1e-300
-        return np.array([-sides[1] - margin, sides[0] + margin]), np.array(y)
+        return moved_out(ends), np.array(y)
 
 
 class ExactRows:
