@@ -93,6 +93,4 @@ def _disturbances(mpc: MPC) -> tuple[Any, np.ndarray]:
     require_kind("mpc", mpc, MPC)
     if mpc.disturbance is None:
         fail("mpc", "has no disturbance", "Give MPC(disturbance=jm.Box(…))")
-    n = mpc.system.n
-    W, E = mpc.disturbance, disturbance_columns(mpc.disturbance_matrix, n)
-    return W, E
+    return mpc.disturbance, disturbance_columns(mpc.disturbance_matrix, mpc.system.n)

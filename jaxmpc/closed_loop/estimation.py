@@ -379,8 +379,8 @@ class KalmanFilter:
         """
         A, B, _ = host_matrices(system)
         n, k = system.n, self.disturbances
-        C = np.asarray(self._matrix(float))
-        M = np.block([[less_identity(A), self.on_states(B)], [C, self.matrix("output")]])
+        moved = np.hstack([less_identity(A), self.on_states(B)])
+        M = np.vstack([moved, self._outputs_of_all()])
         row, column = balanced(M)
         _, values, axes = np.linalg.svd(row[:, None] * M * column)
         if values[n + k - 1] > UNDETECTED * values[0]:
@@ -421,7 +421,7 @@ class KalmanFilter:
 
     def outputs(self, xi: Array) -> Array:
         """Return C ξ (p,)."""
-        return xi[: self.p] if self.C is None else matmul(self._matrix(xi.dtype), xi)
+        return xi[: self.p] if self.C is None else matmul(jnp.asarray(self.C, xi.dtype), xi)
 
     def first(self, xi: Array) -> Belief:
         """Return the estimate before the first output, where the plant starts at ξ; d is 0."""
@@ -434,7 +434,7 @@ class KalmanFilter:
     def corrected(self, belief: Belief, y: Array) -> Belief:
         """Return the estimate after the output y (p,)."""
         mean, P = belief
-        C = self._outputs_of_all(mean.dtype)
+        C = jnp.asarray(self._outputs_of_all(), mean.dtype)
         error = y - matmul(C, mean)
         if P is None:
             return Belief(mean + matmul(jnp.asarray(self.gain, mean.dtype), error), None)
@@ -478,15 +478,11 @@ class KalmanFilter:
         W = jnp.asarray(self._covariance("process"), d.dtype)
         return Belief(after, matmul(A, matmul(P, A.T)) + W)
 
-    def _matrix(self, dtype: Any) -> Array:
-        C = np.eye(self.p, self.model.n) if self.C is None else self.C
-        return jnp.asarray(C, dtype)
-
-    def _outputs_of_all(self, dtype: Any) -> Array:
+    def _outputs_of_all(self) -> Any:
         """Return (C, C_d) (p, n + k), the outputs of states and disturbances."""
-        return jnp.concatenate(
-            [self._matrix(dtype), jnp.asarray(self.matrix("output"), dtype)], axis=1
-        )
+        C = np.eye(self.p, self.model.n) if self.C is None else self.C
+        parts = [C, self.matrix("output")]
+        return (np if concrete(parts) else jnp).concatenate(parts, axis=1)
 
     def _with_disturbances(self, A: Any, B: Any) -> tuple[Any, Any]:
         """Return the matrices of the model of states and disturbances (n + k): of these themselves,
@@ -514,9 +510,7 @@ class KalmanFilter:
         ζ⁺ = A'ζ + C'ν with the weights W and V."""
         W, V = self._covariance("process"), covariance(self.measurement, self.p)
         A, _ = self._with_disturbances(system.A, system.B)
-        C: Any = np.eye(self.p, system.n) if self.C is None else self.C
-        of_loads = self.matrix("output")
-        C = (np if concrete(C, of_loads) else jnp).concatenate([C, of_loads], axis=1)
+        C = self._outputs_of_all()
         if concrete(A, C, W, V):
             A, C, W, V = (np.asarray(v, float) for v in (A, C, W, V))
             units = natural_units(A.T, C.T, W, V)
