@@ -2,10 +2,9 @@
 
 from typing import Any
 
-import numpy as np
-
-from jaxmpc.arrays import Reals, as_weight
+from jaxmpc.arrays import Reals
 from jaxmpc.checks import require_kind, whole
+from jaxmpc.closed_loop.robot_controller import bryson_weights
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.robots.linear_enclosures import LinearEnclosure
 from jaxmpc.sets.convex_sets import Box, translated
@@ -44,13 +43,7 @@ def enclosed_mpc(
     require_kind("enclosure", enclosure, LinearEnclosure)
     whole("horizon", horizon, 1)
     system, (x, u) = enclosure.system, (enclosure.x, enclosure.u)
-    n, m = system.n, system.m
-    if Q is None:
-        parts = np.repeat([1.0, 0.01], n // 2)
-        Q = parts / enclosure.states.half_widths() ** 2
-    if R is None:
-        R = 0.01 / enclosure.inputs.half_widths() ** 2
-    Q, R = as_weight(Q, n), as_weight(R, m)
+    Q, R = bryson_weights(enclosure.states, enclosure.inputs, system.n // 2, Q, R)
     law = lqr(system, Q, R)
     K = law.K if gain is None else gain
     deviations = LinearSystem(system.A, system.B, dt=system.dt)

@@ -87,7 +87,8 @@ def robot_mpc(
     number("margin", margin, 0.0, "Give a fraction in [0, 1)")
     if not margin < 1:
         fail("margin", f"{margin}", "Give a fraction in [0, 1)")
-    Q, R = _weights(robot, Q, R)
+    positions = robot.mujoco.nv if isinstance(robot, Robot) else robot.n - robot.n // 2
+    Q, R = bryson_weights(robot.state_limits, robot.input_limits, positions, Q, R)
     rests = True
     if target is None and isinstance(robot, Robot):
         rest, texts = settled(robot)
@@ -136,15 +137,17 @@ def _limits_of_forces(
         yield replace(stopping, stages=(0, horizon))
 
 
-def _weights(robot: Robot | LinearPlant, Q: Reals | None, R: Reals | None) -> tuple[Reals, Reals]:
-    """Return the weights as matrices, those of Bryson's rule for None."""
+def bryson_weights(
+    states: Box, inputs: Box, positions: int, Q: Reals | None, R: Reals | None
+) -> tuple[Reals, Reals]:
+    """Return the weights as matrices, for None those of Bryson's rule: with half-widths w of limits
+    1/w² for positions, the first coordinates, and 0.01/w² for the others and inputs."""
+    n, m = states.dimension, inputs.dimension
     if Q is None:
-        positions = robot.mujoco.nv if isinstance(robot, Robot) else robot.n - robot.n // 2
-        parts = np.repeat([1.0, 0.01], [positions, robot.n - positions])
-        Q = parts / robot.state_limits.half_widths() ** 2
+        Q = np.repeat([1.0, 0.01], [positions, n - positions]) / states.half_widths() ** 2
     if R is None:
-        R = 0.01 / robot.input_limits.half_widths() ** 2
-    return as_weight(Q, robot.n), as_weight(R, robot.m)
+        R = 0.01 / inputs.half_widths() ** 2
+    return as_weight(Q, n), as_weight(R, m)
 
 
 def _around(limits: Box, margin: float, point: np.ndarray, names: tuple[str, ...]) -> Box:
