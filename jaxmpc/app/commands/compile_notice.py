@@ -9,42 +9,35 @@ from jaxmpc.batches import Compiled
 
 
 class Compiling:
-    """A wait for the compiler, told on stderr from `begin` on until `end`, or the end of `with`.
+    """A wait for the compiler, told on stderr inside `with` until so many programs are ready.
 
     On a terminal one line counts the seconds; elsewhere a line says what compiles, and one that it
-    is compiled.
+    is compiled. programs: 0 where their number is not known.
     """
 
-    def __init__(self) -> None:
-        self._what = ""
-        self._missing = 0
-        self._begun = self._last = 0.0
+    def __init__(self, what: str, programs: int = 0) -> None:
+        self._what, self._missing = what, programs
         self._ended = threading.Event()
         self._counter: threading.Thread | None = None
 
-    def __enter__(self) -> "Compiling":
+    def __enter__(self) -> None:
         Compiled.listeners.append(self._ready)
-        return self
-
-    def __exit__(self, *_: type[BaseException] | BaseException | TracebackType | None) -> None:
-        Compiled.listeners.remove(self._ready)
-        self.end()
-
-    def begin(self, what: str, programs: int = 0) -> None:
-        """Say that this compiles. programs: the number after which it ends; 0: not known."""
-        self._what, self._missing = what, programs
         self._begun = self._last = time.perf_counter()
         if sys.stderr.isatty():
             self._draw()
             self._counter = threading.Thread(target=self._count, daemon=True)
             self._counter.start()
         else:
-            print(f"compiling {what}", file=sys.stderr, flush=True)
+            print(f"compiling {self._what}", file=sys.stderr, flush=True)
+
+    def __exit__(self, *_: type[BaseException] | BaseException | TracebackType | None) -> None:
+        Compiled.listeners.remove(self._ready)
+        self.end()
 
     def end(self) -> None:
         """Say how long it was until the last program was ready, once; nothing where there was
         none, for this process had all of them."""
-        if not self._what or self._ended.is_set():
+        if self._ended.is_set():
             return
         self._ended.set()
         if self._counter is not None:

@@ -76,8 +76,7 @@ class Simulate(SimulateOptions):
         each = 256 if default_platform() == "cpu" else 4096
         chunk = self.chunk or (self.devices or 1) * each
         open_folder(self.output)
-        with Compiling() as wait:
-            wait.begin(f"closed loops of {robot.name}", programs=1)
+        with Compiling(f"closed loops of {robot.name}", programs=1):
             mpc = command.problem(robot, target, file)
             starts, factors = draw_robots(robot, **arguments(self, draw_robots, leave=("robot",)))
             length = f"{seconds:g} {robot.time_unit}"

@@ -117,8 +117,7 @@ def simulate_problem(loops: LinearLoops, output: Path, overwrite: bool) -> None:
     open_folder(output)
     text = loops.disturbance or "none"
     print(f"{config.name}: {loops.count:,} loops of {loops.steps} steps -> {output}")
-    with jax.enable_x64(True), Compiling() as wait:
-        wait.begin(f"closed loops of {config.name}", programs=1)
+    with jax.enable_x64(True), Compiling(f"closed loops of {config.name}", programs=1):
         run, w = loops.run(mpc, x0s)
     states, inputs, status = (np.asarray(v) for v in (run.states, run.inputs, run.status))
     planned = status[:, 0] == Status.SOLVED

@@ -85,18 +85,18 @@ class TuneWeights(TuneWeightsOptions):
         problem = problem_of_file(self) if self.robot is None else problem_of_robot(self)
         task, options = problem.task, self.record(problem)
         folder = run_folder(self.output, FILES, options, self.resume, self.overwrite)
-        with folder as checkpoint, Compiling() as wait:
+        with folder as checkpoint:
             loops = f"{len(task.x0s)} closed loops of {task.steps} time steps"
             print(f"{task.name}: {', '.join(self.tune)} from {loops} -> {self.output}", flush=True)
-            wait.begin(f"closed loops of {task.name} and their gradient", programs=2)
-            run = best_of_steps(
-                lambda: task.tune(
-                    optimizer=optimizer,
-                    **given_options(self, "updates", "batch", "mode", "seed"),
-                    checkpoint=checkpoint,
-                    progress=sys.stderr.isatty(),
+            with Compiling(f"closed loops of {task.name} and their gradient", programs=2):
+                run = best_of_steps(
+                    lambda: task.tune(
+                        optimizer=optimizer,
+                        **given_options(self, "updates", "batch", "mode", "seed"),
+                        checkpoint=checkpoint,
+                        progress=sys.stderr.isatty(),
+                    )
                 )
-            )
         compiling = Compiled.seconds - compiled
         seconds = {"compile": compiling, "run": time.perf_counter() - begun - compiling}
         rows = self.write(problem, run, options, seconds)
