@@ -2,6 +2,7 @@
 
 import dataclasses
 import sys
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -17,7 +18,7 @@ from jaxmpc.checks import fail
 from jaxmpc.explicit.regions import CriticalRegions, critical_regions
 from jaxmpc.export.c_files import CFiles
 from jaxmpc.export.c_law import export_explicit_c
-from jaxmpc.export.c_solver import TOLERANCE, check_fixed_steps, export_c
+from jaxmpc.export.c_solver import TOLERANCE, ClosedLoopCheck, check_fixed_steps, export_c
 from jaxmpc.export.jax_program import export_jax
 from jaxmpc.export.step_search import choose_steps
 from jaxmpc.files import as_json
@@ -51,60 +52,19 @@ class Export(ExportOptions):
         """Write the code and print the check. Raises ValueError for options and files that make no
         sense."""
         config = configs.load(self.config, given_options(self, "horizon", "terminal"), "info")
-        lower, upper = config.state_range()
-        if self.law == "steps" and self.plans and not np.isfinite([*lower, *upper]).all():
+        ends, checked = config.state_range(), self.law == "steps" and self.plans > 0
+        if checked and not np.isfinite(ends).all():
             fail("limits.x_min", "bounds not every state", "Give --plans 0 for no check")
         mpc, solver = config.build_controlled(), config.build_solver() or ADMM()
-        chosen = self.law == "steps" and self.plans and config.solver is None
         if self.law == "explicit" and self.iterations is not None:
             what = f"{self.iterations} where --law explicit has regions and takes no steps"
             fail("--iterations", what, "Leave it out, or take --law steps")
         if self.iterations is not None:
             solver = dataclasses.replace(solver, iterations=self.iterations)
-        dtype: Literal["float32", "float64"] = "float32" if self.single else "float64"
-        tolerance = TOLERANCE[dtype] if self.tolerance is None else self.tolerance
-        rows: list[tuple[str, str]] = []
-        summary: dict[str, Any] = {"name": config.name, "law": self.law}
-        if chosen:  # what is wrong with the files is said before the work
-            CFiles.open(self.output, self.name, dtype, tolerance, TOLERANCE, self.overwrite)
-            print("choosing steps along closed loops; some 20 s", file=sys.stderr)
-            solver = choose_steps(
-                mpc,
-                lower,
-                upper,
-                iterations=self.iterations,
-                plans=self.plans,
-                tolerance=tolerance,
-                progress=True,
-                **config.references(),
-            )
-        if self.law == "explicit":
-            print("searching regions", file=sys.stderr)
-            regions = _regions(config, mpc)
-            paths = export_explicit_c(
-                regions,
-                self.output,
-                name=self.name,
-                dtype=dtype,
-                tolerance=self.tolerance,
-                overwrite=self.overwrite,
-            )
-            rows += [("regions", f"{len(regions)}, which fill the feasible set")]
-            summary |= {"regions": len(regions)}
-        elif self.law == "jax":
-            path = self.output / f"{self.name}.jax"
-            paths = [export_jax(mpc, path, solver, dtype=dtype, overwrite=self.overwrite)]
-        else:
-            paths = export_c(
-                mpc,
-                self.output,
-                solver,
-                name=self.name,
-                dtype=dtype,
-                tolerance=tolerance,
-                overwrite=self.overwrite,
-            )
-            summary |= {"iterations": solver.iterations, "tolerance": tolerance}
+        tolerance = TOLERANCE[self.dtype] if self.tolerance is None else self.tolerance
+        if checked and config.solver is None:
+            solver = self.chosen_steps(mpc, ends, tolerance, config.references())
+        paths, rows, summary = self.written(config, mpc, solver, tolerance)
         if config.references():
             said = "an argument of the function: what the file says is not in the code"
             if self.law == "explicit":
@@ -115,27 +75,13 @@ class Export(ExportOptions):
         size = lambda path: f"{path.stat().st_size / 1024:.1f} KiB{kind}"
         rows = [(str(path), size(path)) for path in paths] + rows
         summary |= {"files": [str(path) for path in paths]}
-        if self.law == "steps" and self.plans:
+        if checked:
             print("checking closed loops; compiling, some 20 s", file=sys.stderr)
             found = check_fixed_steps(
-                mpc, solver, lower, upper, self.plans, tolerance, **config.references()
+                mpc, solver, *ends, self.plans, tolerance, **config.references()
             )
-            share = 100 * found.reached / max(found.solvable, 1)
             summary |= dataclasses.asdict(found)
-            units = set(mpc.system.input_units or ())
-            unit = f" {units.pop()}" if len(units) == 1 else ""
-            given = "" if config.solver else ", chosen, as their penalties, for 99 % below"
-            if config.solver is None and self.iterations is not None:
-                given = ", given; their penalties are chosen for the share below"
-            elif config.solver is None and share < 99:
-                given = ", chosen, as their penalties; 99 % need more --iterations"
-            rows += [
-                ("ADMM steps a call", f"{solver.iterations}{given}"),
-                ("plans of closed loops", f"{found.plans}, {found.solvable} can be solved"),
-                ("solved by the C code's steps", f"{share:.1f} % of these, to {tolerance:g}"),
-                ("largest error of u where solved", f"{found.input_error:.2g}{unit}"),
-                ("largest error of u at all of these", f"{found.input_error_any:.2g}{unit}"),
-            ]
+            rows += self.check_rows(config, found, solver, tolerance)
         print_table(rows, max(len(name) for name, _ in rows))
         if self.law == "jax":
             read = f'jax.export.deserialize(open("{paths[0]}", "rb").read())'
@@ -144,3 +90,64 @@ class Export(ExportOptions):
             call = f"cc -std=c99 -O2 {self.name}.c {self.name}_example.c -lm -o example"
             print(f"\nNext: cd {self.output} && {call}")
         return Outcome(summary=as_json(summary))
+
+    @property
+    def dtype(self) -> Literal["float32", "float64"]:
+        """Return the precision of the code."""
+        return "float32" if self.single else "float64"
+
+    def chosen_steps(
+        self, mpc: MPC, ends: tuple[np.ndarray, np.ndarray], tolerance: float, references: Any
+    ) -> ADMM:
+        """Return the solver that `choose_steps` finds from states between these ends."""
+        # What is wrong with the files is said before the work.
+        CFiles.open(self.output, self.name, self.dtype, tolerance, TOLERANCE, self.overwrite)
+        print("choosing steps along closed loops; some 20 s", file=sys.stderr)
+        return choose_steps(
+            mpc,
+            *ends,
+            iterations=self.iterations,
+            plans=self.plans,
+            tolerance=tolerance,
+            progress=True,
+            **references,
+        )
+
+    def written(
+        self, config: configs.Config, mpc: MPC, solver: ADMM, tolerance: float
+    ) -> tuple[list[Path], list[tuple[str, str]], dict[str, Any]]:
+        """Write the files of --law, and return them, rows of the table and what the summary has."""
+        summary: dict[str, Any] = {"name": config.name, "law": self.law}
+        given: dict[str, Any] = {"dtype": self.dtype, "overwrite": self.overwrite}
+        if self.law == "jax":
+            path = self.output / f"{self.name}.jax"
+            return [export_jax(mpc, path, solver, **given)], [], summary
+        given |= {"name": self.name}
+        if self.law == "explicit":
+            print("searching regions", file=sys.stderr)
+            regions = _regions(config, mpc)
+            paths = export_explicit_c(regions, self.output, tolerance=self.tolerance, **given)
+            rows = [("regions", f"{len(regions)}, which fill the feasible set")]
+            return paths, rows, summary | {"regions": len(regions)}
+        paths = export_c(mpc, self.output, solver, tolerance=tolerance, **given)
+        return paths, [], summary | {"iterations": solver.iterations, "tolerance": tolerance}
+
+    def check_rows(
+        self, config: configs.Config, found: ClosedLoopCheck, solver: ADMM, tolerance: float
+    ) -> list[tuple[str, str]]:
+        """Return the rows of the table on what `check_fixed_steps` found."""
+        share = 100 * found.reached / max(found.solvable, 1)
+        given = "" if config.solver else ", chosen, as their penalties, for 99 % below"
+        if config.solver is None and self.iterations is not None:
+            given = ", given; their penalties are chosen for the share below"
+        elif config.solver is None and share < 99:
+            given = ", chosen, as their penalties; 99 % need more --iterations"
+        units = set(config.system.input_units or ())
+        unit = f" {units.pop()}" if len(units) == 1 else ""
+        return [
+            ("ADMM steps a call", f"{solver.iterations}{given}"),
+            ("plans of closed loops", f"{found.plans}, {found.solvable} can be solved"),
+            ("solved by the C code's steps", f"{share:.1f} % of these, to {tolerance:g}"),
+            ("largest error of u where solved", f"{found.input_error:.2g}{unit}"),
+            ("largest error of u at all of these", f"{found.input_error_any:.2g}{unit}"),
+        ]
