@@ -126,13 +126,6 @@ def load_robot(
     limits = overridden("torque", inputs, torque, slice(None))
     if torque is not None:
         input_sources = _argument_sources(inputs, limits, slice(None))
-    smooth = copy.deepcopy(host)
-    for kind in ("contact", "limit", "frictionloss") if equalities(host) else ("constraint",):
-        smooth.opt.disableflags |= flag(kind)
-    smooth.opt.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL  # MJX fails on others without contacts
-    smooth.actuator_forcelimited[:] = 0
-    smooth.jnt_actfrclimited[:] = 0
-    smooth.tendon_actfrclimited[:] = 0
     labels, units = coordinate_names(host)
     require_printable("model", name, *labels)
     states, sources = state_limits(host, position, velocity, file.velocities)
@@ -158,7 +151,7 @@ def load_robot(
         file=given,
         shapes=file.shapes,
         plant=plant,
-        predictor=Physics(smooth),
+        predictor=Physics(_smooth(host)),
         anchor=_anchor(host, q),
         substeps=substeps,
         dt=period,
@@ -266,6 +259,18 @@ def _periods(
         problem = f"{control_period:g} s is no multiple of the physics step {h:g} s"
         fail("control_period", problem, "Give whole multiples, or another timestep")
     return substeps, control_period
+
+
+def _smooth(host: "mujoco.MjModel") -> "mujoco.MjModel":
+    """Return a copy without contacts, stops, friction and limits of forces."""
+    found = copy.deepcopy(host)
+    for kind in ("contact", "limit", "frictionloss") if equalities(host) else ("constraint",):
+        found.opt.disableflags |= flag(kind)
+    found.opt.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL  # MJX fails on others without contacts
+    found.actuator_forcelimited[:] = 0
+    found.jnt_actfrclimited[:] = 0
+    found.tendon_actfrclimited[:] = 0
+    return found
 
 
 def _warn_of_limits(name: str, labels: Sequence[str], sources: Sequence[str]) -> None:
