@@ -459,18 +459,7 @@ def least_distance_form(
         fail(name, f"{flat}, as equalities tie the states to each other", "Relax one of them")
     # z = shift + S x + N w
     N, S, shift_z = hull.basis[n:, n:], hull.basis[n:, :n], hull.shift[n:]
-    curvature, terms = N.T @ given.P @ N, np.diag(np.abs(N).T @ np.abs(given.P) @ np.abs(N))
-    unit = 1 / np.sqrt(np.where(terms > 0, terms, 1.0))
-    # Rounding decides whether a singular matrix has a Cholesky factor.
-    least = np.linalg.eigvalsh(unit[:, None] * curvature * unit).min(initial=1.0)
-    if least <= SINGULAR:
-        if isinstance(problem, MPC):
-            problem.require_unique_inputs()  # names the weight that is missing
-            what = "leaves the condensed cost singular in float64"
-            fail("R", what, "Put a larger weight on inputs")
-        what = "is singular in float64 where rows leave z free: the optimum is not unique"
-        fail("P", what, "Add a small multiple of the unit matrix")
-    factor = np.linalg.cholesky(curvature)
+    factor = _factor_of_cost(problem, given.P, N)
     G, V, v = hull.G[:, n:], -hull.G[:, :n], hull.g
     row, side = given.row[hull.rows], given.side[hull.rows]
 
@@ -546,6 +535,22 @@ def least_distance_form(
         size=size,
         interior=ball[-n:],
     )
+
+
+def _factor_of_cost(problem: MPC | ParametricQP, P: np.ndarray, N: np.ndarray) -> np.ndarray:
+    """Return the Cholesky factor of N'PN. Raises ValueError, naming a weight, where it is singular
+    in float64: rounding decides whether a singular matrix has one."""
+    curvature, terms = N.T @ P @ N, np.diag(np.abs(N).T @ np.abs(P) @ np.abs(N))
+    unit = 1 / np.sqrt(np.where(terms > 0, terms, 1.0))
+    least = np.linalg.eigvalsh(unit[:, None] * curvature * unit).min(initial=1.0)
+    if least <= SINGULAR:
+        if isinstance(problem, MPC):
+            problem.require_unique_inputs()  # names the weight that is missing
+            what = "leaves the condensed cost singular in float64"
+            fail("R", what, "Put a larger weight on inputs")
+        what = "is singular in float64 where rows leave z free: the optimum is not unique"
+        fail("P", what, "Add a small multiple of the unit matrix")
+    return np.linalg.cholesky(curvature)
 
 
 # --- The affine law of an active set, and its region ------------------------------------
