@@ -113,6 +113,24 @@ def _forget_programs():
     gc.collect()
 
 
+@pytest.fixture
+def x64():
+    """Let JAX compute in float64 during a test."""
+    import jax
+
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture(scope="module")
+def x64_of_module():
+    """The same for the fixtures that all tests of a module share."""
+    import jax
+
+    with jax.enable_x64(True):
+        yield
+
+
 @pytest.fixture(scope="module")
 def compiled():
     """Return a list to which each program that is compiled is added; clear it at will."""

@@ -15,10 +15,7 @@ from jaxmpc.closed_loop import Environment, LinearFeedback, randomised
 SPREAD = 0.05
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _float64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("x64_of_module")
 
 
 @pytest.fixture(scope="module")

@@ -30,10 +30,7 @@ FILTER = KalmanFilter(SYSTEM, W.tolist(), [0.03], C=[[1.0, 0.0]])
 STEPS, LOOPS = 60, 4000
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _float64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("x64_of_module")
 
 
 def test_noise_is_continuous_in_its_covariance():

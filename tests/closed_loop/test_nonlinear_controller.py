@@ -26,10 +26,7 @@ def car(x, u):
     return x + H * rate
 
 
-@pytest.fixture(autouse=True)
-def in_float64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("x64")
 
 
 def problem(model=car, obstacle=True, **fields):

@@ -38,10 +38,7 @@ LAG = np.linalg.inv(np.eye(3) - A)
 GAIN, BOX = LAG @ B, np.vstack([np.eye(2), -np.eye(2)])
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _float64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("x64_of_module")
 
 
 def observer(*disturbances, system=SYSTEM, C=C, **fields):

@@ -23,10 +23,7 @@ PRECISE = jm.ADMM(iterations=500, rho=1.0, alpha=1.6, newton_steps=6)
 PENALTY = 1e4
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _float64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("x64_of_module")
 
 
 def solve_by_clarabel(mpc, A, B, c, xi, reference, input_reference, *, penalty=PENALTY):

@@ -12,7 +12,6 @@ import jax
 import numpy as np
 import problems
 import pytest
-from jax import enable_x64
 
 import jaxmpc as jm
 from jaxmpc.feasible.candidate_search import (
@@ -41,10 +40,7 @@ MADE = {
 NAMES = pytest.mark.parametrize("name", MADE)
 
 
-@pytest.fixture(autouse=True)
-def _x64():
-    with enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("x64")
 
 
 @functools.cache

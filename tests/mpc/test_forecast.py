@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import jax
 import numpy as np
 import pytest
 
@@ -16,10 +15,7 @@ X0, U0 = np.array([0.4, -0.3]), np.array([0.2])
 PLAIN = jm.MPC(UNSTABLE, np.diag([3.0, 1.0]), [[0.5]], N, terminal_cost=np.diag([9.0, 4.0]))
 
 
-@pytest.fixture(autouse=True)
-def _float64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("x64")
 
 
 def least_squares(mpc, moves):

@@ -15,10 +15,7 @@ HORIZONS = (3, 5, 8)
 X0 = np.array([[0.5, -0.2], [0.6, 0.1], [-0.7, 0.2]])
 
 
-@pytest.fixture(autouse=True, scope="module")
-def double_precision():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("x64_of_module")
 
 
 def problem(horizon, **fields):

@@ -18,10 +18,7 @@ PRECISE = jm.ADMM(eps=1e-10)
 SOLVED = jm.Status.SOLVED
 
 
-@pytest.fixture(autouse=True)
-def _float64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("x64")
 
 
 @cache

@@ -21,10 +21,7 @@ FINE = jm.ADMM(iterations=400, newton_steps=30, eps=1e-8)
 PLAIN = jm.ADMM(iterations=1000, newton_steps=0)  # compiles fastest
 
 
-@pytest.fixture(autouse=True)
-def x64():
-    with enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("x64")
 
 
 def free(horizon=8, terminal_cost=None) -> jm.MPC:

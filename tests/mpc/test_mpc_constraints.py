@@ -27,10 +27,7 @@ ONE, EYE = np.ones(2), np.eye(2)
 FINE = jm.ADMM(iterations=300, newton_steps=30, eps=1e-8)
 
 
-@pytest.fixture(autouse=True)
-def x64():
-    with enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("x64")
 
 
 class Explicit:

@@ -19,12 +19,6 @@ SOLVED = jm.Status.SOLVED
 CART, POLE, LENGTH, GRAVITY = 1.0, 0.1, 0.8, 9.81
 
 
-@pytest.fixture
-def x64():
-    with jax.enable_x64(True):
-        yield
-
-
 class Pendulum:
     """A pendulum on a cart, one step of 0.05 s by the classical Runge-Kutta method."""
 

@@ -24,10 +24,7 @@ N, n, m = 8, 3, 2
 SOLVER = jm.ADMM(iterations=20, newton_steps=5)  # ADMM alone leaves 1e-3
 
 
-@pytest.fixture(autouse=True)
-def x64():
-    with enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("x64")
 
 
 @cache

@@ -27,10 +27,7 @@ LIMITS += ("outputs.upper", "soft.C", "soft.upper", "soft.rho", "soft.quadratic"
 LIMITS += ("input_rate_limit",)
 
 
-@pytest.fixture(autouse=True, scope="module")
-def double_precision():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("x64_of_module")
 
 
 def definite(rng, size, count=N):

@@ -20,10 +20,7 @@ X0, AIM, EFFORT = np.array([1.0, -0.6]), np.array([0.3, 0.1]), np.array([0.1, -0
 SOLVER, UNROLLED = jm.ADMM(eps=1e-9), jm.ADMM(200, newton_steps=0, differentiate="unrolled")
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _float64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("x64_of_module")
 
 
 def skewed(diagonal, skew):

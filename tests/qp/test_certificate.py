@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax import enable_x64
 
 import jaxmpc as jm
 from jaxmpc.qp.problem import Bounds
@@ -28,10 +27,7 @@ EPS = 2.0**-52
 M, N = 8, 3
 
 
-@pytest.fixture(autouse=True)
-def _x64():
-    with enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("x64")
 
 
 def program(A=None, l=(), u=(), P=None, q=(), y=(), d=()):

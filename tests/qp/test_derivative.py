@@ -28,12 +28,6 @@ UNROLLED = replace(PLAIN, differentiate="unrolled")
 DIRECTIONS = ("P", "q", "A", "l", "u", "bounds", "soft_linear", "soft_quadratic", "radius")
 
 
-@pytest.fixture
-def x64():
-    with enable_x64(True):
-        yield
-
-
 BATCH = 64  # one compiled program of one shape serves most tests
 
 

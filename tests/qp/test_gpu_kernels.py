@@ -29,12 +29,6 @@ from jaxmpc.qp.triton_source import triton_source
 STEPS = 12
 
 
-@pytest.fixture
-def x64():
-    with jax.enable_x64(True):
-        yield
-
-
 def scaled_batch(n, m, B, *, soft=False, balls=(), stages=1, dtype=jnp.float32, seed=0):
     """Random programs that share P and A, in ADMM's coordinates: factor, q (B, n), bounds, t."""
     rng = np.random.default_rng(seed)

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import problems
 import pytest
-from jax import enable_x64
 from scipy.optimize import linprog
 
 import jaxmpc as jm
@@ -15,10 +14,7 @@ import jaxmpc as jm
 INF = np.inf
 
 
-@pytest.fixture(autouse=True)
-def x64():
-    with enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("x64")
 
 
 def rows(A, l, u, **fields) -> jm.QP:

@@ -35,12 +35,6 @@ solve_warm = jax.jit(
 )
 
 
-@pytest.fixture
-def x64():
-    with enable_x64(True):
-        yield
-
-
 def as32(tree):
     return jax.tree.map(np.float32, tree)
 

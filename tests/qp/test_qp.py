@@ -71,12 +71,6 @@ def as32(qp: jm.QP) -> jm.QP:
     return jax.tree.map(np.float32, qp)
 
 
-@pytest.fixture
-def x64():
-    with enable_x64(True):
-        yield
-
-
 class TestKnownAnswers:
     @pytest.mark.parametrize("n", [1, 5, 20, pytest.param(60, marks=pytest.mark.slow)])
     @pytest.mark.slow

@@ -14,11 +14,7 @@ from jaxmpc.closed_loop.simulation import require_variations
 from jaxmpc.robots import RobotModel, tasks
 from jaxmpc.robots.parameters import FIELDS
 
-
-@pytest.fixture(autouse=True)
-def double_precision():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("x64")
 
 
 # One of each: joints, stops with margins, springs, friction, tendons, actuators, an equality, a

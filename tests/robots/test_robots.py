@@ -64,10 +64,7 @@ URDF = """
 </robot>"""
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _float64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("x64_of_module")
 
 
 def draw(robot, count, seed=0, stretch=1.0, speed=1.0):

@@ -44,12 +44,6 @@ TWO_ARMS = """
 """
 
 
-@pytest.fixture
-def x64():
-    with jax.enable_x64(True):
-        yield
-
-
 @pytest.fixture(scope="module")
 def two():
     model = mujoco.MjModel.from_xml_string(TWO_ARMS)

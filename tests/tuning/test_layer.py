@@ -43,12 +43,6 @@ def test_rows_that_soften_made_have_names():
 NAMES = ("Q", "R", "A", "B", "inputs.upper", "soft.rho")
 
 
-@pytest.fixture
-def x64():
-    with jax.enable_x64(True):
-        yield
-
-
 @pytest.fixture(scope="module")
 def layer():
     # Without Newton steps a program compiles several times faster.

@@ -21,12 +21,6 @@ LOSS = jm.ClosedLoopLoss([1.0, 0.1], [0.01])
 PARAMETERS = {"Q": Parameter(MPC.Q, "diagonal"), "R": Parameter(MPC.R, "positive")}
 
 
-@pytest.fixture
-def x64():
-    with jax.enable_x64(True):
-        yield
-
-
 class Formula(ClosedLoopObjective):
     """A loss of θ in closed form in place of closed loops; loss: θ → number."""
 

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
@@ -19,10 +18,7 @@ STARTS = np.random.default_rng(0).normal(size=(8, 2))
 ENDS = {"a": np.array([1.0, 0.0]), "b": np.array([-2.0, 4.0])}
 
 
-@pytest.fixture(autouse=True)
-def x64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("x64")
 
 
 def options(**more):
