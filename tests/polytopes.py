@@ -19,6 +19,11 @@ def cube(n, half=1.0):
     return Polytope(np.vstack([np.eye(n), -np.eye(n)]), np.full(2 * n, half))
 
 
+def interval(polytope):
+    """(lower, upper) of a set on the line."""
+    return -polytope.support(np.array([-1.0])), polytope.support(np.array([1.0]))
+
+
 def unimodular(rng, n):
     """An integer matrix with determinant 1 and its inverse, exactly."""
     T = np.eye(n)

@@ -8,6 +8,7 @@ import jax
 import numpy as np
 import problems
 import pytest
+from polytopes import interval
 from problems import symmetric
 
 from jaxmpc import Box, LinearSystem, Polytope
@@ -31,11 +32,6 @@ LECTURE = LinearSystem([[1, 1], [0, 1]], [[0.4], [1]])
 
 
 UNSTABLE = LinearSystem([[2.0]], [[1.0]])
-
-
-def interval(polytope):
-    """(lower, upper) of a set on the line."""
-    return -polytope.support(np.array([-1.0])), polytope.support(np.array([1.0]))
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from polytopes import assert_same_points
+from polytopes import assert_same_points, interval
 from problems import symmetric
 
 from jaxmpc import Box, LinearSystem, Polytope, lqr, maximal_invariant_set
@@ -151,11 +151,6 @@ def test_unbounded_invariant_set():
     decay = LinearSystem(0.5 * np.eye(2), [[1], [0]])
     with pytest.raises(ValueError, match="states: the invariant set is unbounded"):
         maximal_invariant_set(decay, np.zeros((1, 2)), Box([-1, -INF], [1, INF]), None)
-
-
-def interval(polytope):
-    """(lower, upper) of a set on the line."""
-    return -polytope.support(np.array([-1.0])), polytope.support(np.array([1.0]))
 
 
 def test_robust_invariant_sets_on_the_line():

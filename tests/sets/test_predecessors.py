@@ -2,17 +2,13 @@
 
 import numpy as np
 import pytest
+from polytopes import interval
 from problems import symmetric
 
 from jaxmpc import Box, LinearSystem, Polytope
 from jaxmpc.sets.predecessors import predecessor
 
 UNSTABLE = LinearSystem([[2.0]], [[1.0]])
-
-
-def interval(polytope):
-    """(lower, upper) of a set on the line."""
-    return -polytope.support(np.array([-1.0])), polytope.support(np.array([1.0]))
 
 
 def test_predecessor_on_the_line():
