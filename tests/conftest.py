@@ -114,6 +114,13 @@ def _forget_programs():
 
 
 @pytest.fixture
+def in_empty_folder(tmp_path, monkeypatch):
+    """Run commands in an empty folder, for a terminal of 100 columns."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "100")
+
+
+@pytest.fixture
 def x64():
     """Let JAX compute in float64 during a test."""
     import jax

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 import xarray as xr
 import zarr
+from command_line import run
 
 from jaxmpc.app import cli
 from jaxmpc.app import config as configs
@@ -32,11 +33,7 @@ from jaxmpc.recursion.report import RecursionReport, SmallestHorizon
 from jaxmpc.sets.convex_sets import Box
 from jaxmpc.store.writing import Lock
 
-
-@pytest.fixture(autouse=True)
-def _in_empty_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("COLUMNS", "100")
+pytestmark = pytest.mark.usefixtures("in_empty_folder")
 
 
 @pytest.fixture
@@ -44,10 +41,6 @@ def no_compile(monkeypatch):
     """Fail if the sweep starts: errors must be found before."""
     started = lambda *a, **k: pytest.fail("the sweep started")
     monkeypatch.setattr(pipeline, "label_parts", started)
-
-
-def run(line):
-    return cli.main(shlex.split(line))
 
 
 def test_sweep_writes_files_and_table(tmp_path, capsys):

@@ -2,7 +2,6 @@
 
 import json
 import os
-import shlex
 import signal
 import subprocess
 import sys
@@ -12,6 +11,7 @@ import time
 import numpy as np
 import pytest
 import xarray as xr
+from command_line import run
 
 from jaxmpc import batches, store
 from jaxmpc.app import cli
@@ -20,14 +20,8 @@ from jaxmpc.store.writing import Lock
 
 
 @pytest.fixture(autouse=True)
-def _in_empty_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("COLUMNS", "100")
+def _prepared(in_empty_folder, monkeypatch):
     monkeypatch.setattr(stored, "CHUNK", 64)
-
-
-def run(line):
-    return cli.main(shlex.split(line))
 
 
 LINE = "sweep --grid 40 10 --horizon 6"  # 7 blocks of up to 6 rows

@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 import pytest
 import xarray as xr
+from command_line import rows
 from PIL import Image
 
 import jaxmpc as jm
@@ -51,9 +52,7 @@ def mpc(joint):
 
 
 @pytest.fixture(autouse=True)
-def _in_empty_folder(tmp_path, monkeypatch, joint):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("COLUMNS", "100")
+def _prepared(in_empty_folder, monkeypatch, joint):
     given = lambda name: joint if name == "joint" else jm.load_robot(name)
     monkeypatch.setattr(simulate, "load_robot", given)
 
@@ -64,12 +63,6 @@ def run(line):
 
 def no_renderer(*args, **kwargs):
     raise mujoco.FatalError("an OpenGL platform library has not been loaded")
-
-
-def rows(out):
-    """The table: {name: rest of the line}."""
-    lines = (line for line in out.splitlines() if line.startswith("  "))
-    return {line[2:16].strip(): line[16:].strip() for line in lines}
 
 
 @pytest.mark.slow

@@ -20,9 +20,7 @@ PLANS = "--what plans --families joint --horizons 3 --batches 8 --tolerances 1e-
 
 
 @pytest.fixture(autouse=True)
-def _in_empty_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("COLUMNS", "100")
+def _prepared(in_empty_folder, monkeypatch):
     monkeypatch.setattr(Ceilings, "measure", lambda rounds=3: Ceilings(1.0, 1.0, 1.0))
 
 

@@ -1,7 +1,6 @@
 """Maps of robots: predictions against the C engine, closed loops of known ends, and the files."""
 
 import json
-import shlex
 from dataclasses import replace
 
 import jax
@@ -9,10 +8,10 @@ import mujoco
 import numpy as np
 import problems
 import pytest
+from command_line import run
 from scipy.optimize import linprog
 
 import jaxmpc as jm
-from jaxmpc.app import cli
 from jaxmpc.app.plots import plot_robot_map
 from jaxmpc.feasible.pipeline import Labels
 from jaxmpc.robot_maps import OUTCOMES, map_robot, mapping
@@ -238,10 +237,6 @@ def test_wrong_arguments_are_named(change, message):
     given = {"robot": plant, "mpc": mpc, "x0s": np.zeros((3, 1)), "seconds": 2.0} | change
     with pytest.raises(ValueError, match=message):
         map_robot(**given)
-
-
-def run(line):
-    return cli.main(shlex.split(line))
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 import problems
 import pytest
+from command_line import rows
 
 import jaxmpc as jm
 from jaxmpc.app import cli
@@ -27,10 +28,7 @@ LINE = (
 )
 
 
-@pytest.fixture(autouse=True)
-def _in_empty_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("COLUMNS", "100")
+pytestmark = pytest.mark.usefixtures("in_empty_folder")
 
 
 @pytest.fixture
@@ -46,12 +44,6 @@ def given_starts(monkeypatch):
 
 def run(line):
     return cli.main(["tune", *shlex.split(line)])
-
-
-def rows(out):
-    """The table: {name: rest of the line}."""
-    lines = (line for line in out.splitlines() if line.startswith("  "))
-    return {line[2:16].strip(): line[16:].strip() for line in lines}
 
 
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
