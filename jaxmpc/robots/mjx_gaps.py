@@ -235,13 +235,18 @@ def mesh_contacts(model: "mujoco.MjModel") -> int:
 
 
 def _dimension(model: "mujoco.MjModel", first: int, second: int, pair: int) -> int:
-    """Return condim of a contact: of the pair, of the geom of higher priority, or the larger."""
+    """Return condim of a contact, of an explicit pair its own."""
     if pair >= 0:
         return int(model.pair_dim[pair])
-    condim, priority = model.geom_condim, model.geom_priority
+    return int(_of_two(model, model.geom_condim, first, second))
+
+
+def _of_two(model: "mujoco.MjModel", values: np.ndarray, first: int, second: int) -> Any:
+    """Return what a contact of two geoms has: that of higher priority, or the larger."""
+    priority = model.geom_priority
     if priority[first] == priority[second]:
-        return int(max(condim[first], condim[second]))
-    return int(condim[first if priority[first] > priority[second] else second])
+        return np.maximum(values[first], values[second])
+    return values[first if priority[first] > priority[second] else second]
 
 
 def _without_frictionless(model: "mujoco.MjModel") -> list[str]:
@@ -270,20 +275,12 @@ def _without_frictionless(model: "mujoco.MjModel") -> list[str]:
     for contact in _possible_contacts(model):
         if contact in found or contact[2] >= 0:
             continue
-        before, after = (_friction(m, *contact[:2]) for m in (model, changed))
+        before, after = (_of_two(m, m.geom_friction, *contact[:2]) for m in (model, changed))
         if not np.array_equal(before, after):
             return []
     for field in ("geom_condim", "geom_friction", "pair_dim", "pair_friction"):
         getattr(model, field)[:] = getattr(changed, field)
     return [f"condim 1 of {len(found)} contacts, 3 with a friction of 1e-5 in its place"]
-
-
-def _friction(model: "mujoco.MjModel", first: int, second: int) -> np.ndarray:
-    """Return the friction of a contact of two geoms: of higher priority, or the larger."""
-    friction, priority = model.geom_friction, model.geom_priority
-    if priority[first] == priority[second]:
-        return np.maximum(friction[first], friction[second])
-    return friction[first if priority[first] > priority[second] else second]
 
 
 def _with_pyramids(model: "mujoco.MjModel") -> None:
