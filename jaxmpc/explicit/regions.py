@@ -2,6 +2,7 @@
 
 import time
 from collections import deque
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -182,34 +183,29 @@ class CriticalRegions:
     def plan(self, x0s: Reals) -> np.ndarray:
         """Return optimal z (nz,) at parameters θ (p,), or (B, nz) at x0s (B, p); NaN where no
         region holds them."""
-        return self._evaluate(x0s, [(region.Z, region.z0) for region in self.regions])
+        return self._evaluate(x0s, lambda r, x: x @ r.Z.T + r.z0, len(self.regions[0].z0))
 
     def law(self, x0s: Reals) -> np.ndarray:
         """Return the law (m,) at parameters θ (p,), or (B, m) at x0s (B, p): first inputs u_0 of an
         MPC; NaN where no region holds them."""
-        return self._evaluate(x0s, [(region.K, region.k) for region in self.regions])
+        return self._evaluate(x0s, lambda r, x: x @ r.K.T + r.k, len(self.regions[0].k))
 
     def value(self, x0s: Reals) -> np.ndarray:
         """Return the least cost at parameters θ (p,), or (B,) at x0s (B, p), NaN where no region
         holds them: a piecewise quadratic function."""
-        x, shape = self._states(x0s)
-        where = self.find(x)
-        values = np.full(len(x), np.nan)
-        for i in np.unique(where[where >= 0]):
-            region, here = self.regions[i], x[where == i]
-            values[where == i] = (here @ region.V / 2 * here).sum(axis=1) + here @ region.v
-            values[where == i] += region.v0
-        return values.reshape(shape)
+        return self._evaluate(x0s, lambda r, x: (x @ r.V / 2 * x).sum(axis=1) + x @ r.v + r.v0)
 
-    def _evaluate(self, x0s: Reals, laws: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-        """Return gain x + offset of the region that holds each θ."""
+    def _evaluate(
+        self, x0s: Reals, function: Callable[[Region, np.ndarray], np.ndarray], *size: int
+    ) -> np.ndarray:
+        """Return function(r, x) (k, *size) of each θ, r the region that holds θ (k, p); NaN where
+        none does."""
         x, shape = self._states(x0s)
         where = self.find(x)
-        values = np.full((len(x), len(laws[0][1])), np.nan)
+        values = np.full((len(x), *size), np.nan)
         for i in np.unique(where[where >= 0]):
-            gain, offset = laws[i]
-            values[where == i] = x[where == i] @ gain.T + offset
-        return values.reshape(*shape, values.shape[1])
+            values[where == i] = function(self.regions[i], x[where == i])
+        return values.reshape((*shape, *size))
 
     def _states(self, x0s: Reals) -> tuple[np.ndarray, tuple[int, ...]]:
         """Return parameters as rows (B, p), and the shape of one number for each: () or (B,)."""
