@@ -218,12 +218,17 @@ def _row_steps(found: Sequence[Block]) -> tuple[np.ndarray, np.ndarray]:
     return step.astype(int), np.concatenate([np.zeros(0, bool), *moved])
 
 
-def generator_form(W: Any, dtype: DTypeLike) -> tuple[Array, Array]:
-    """Return center (p,) and Γ (p, g) of w = center + Γ ω, |ω_i| ≤ 1."""
+def generator_form(mpc: MPC, dtype: DTypeLike) -> tuple[Array, Array, Array]:
+    """Return center (p,) and Γ (p, g) of w = center + Γ ω, |ω_i| ≤ 1, and E (n, p), by which w
+    enters the states."""
+    W: Any = mpc.disturbance
+    E = jnp.eye(mpc.system.n, dtype=dtype)
+    if mpc.disturbance_matrix is not None:
+        E = jnp.asarray(mpc.disturbance_matrix, dtype)
     if isinstance(W, Box):
         lower, upper = (jnp.asarray(v, dtype) for v in (W.lower, W.upper))
-        return (lower + upper) / 2, jnp.diag((upper - lower) / 2)
-    return jnp.asarray(W.center, dtype), jnp.asarray(W.generators, dtype)
+        return (lower + upper) / 2, jnp.diag((upper - lower) / 2), E
+    return jnp.asarray(W.center, dtype), jnp.asarray(W.generators, dtype), E
 
 
 def _plan_extent(nominal: Condensed, reach: Array) -> tuple[Array, tuple[Array, Array]]:
@@ -274,11 +279,8 @@ def _input_sizes(mpc: MPC, dtype: DTypeLike) -> tuple[Array, Array] | None:
 @own_modes
 def _affine(nominal: Condensed, each: Condensed, mpc: MPC) -> PolicyCondensed:
     dtype, N, n, m = nominal.P.dtype, mpc.horizon, mpc.system.n, mpc.system.m
-    center, Gamma = generator_form(mpc.disturbance, dtype)
+    center, Gamma, E = generator_form(mpc, dtype)
     p, g = Gamma.shape
-    E = jnp.eye(n, dtype=dtype)
-    if mpc.disturbance_matrix is not None:
-        E = jnp.asarray(mpc.disturbance_matrix, dtype)
     found = given_blocks(mpc, dtype)
     # Row (j, q): what w_j = e_q alone adds.
     pushes = jnp.einsum("jk,nq->jqkn", jnp.eye(N, dtype=dtype), E).reshape(N * p, N, n)

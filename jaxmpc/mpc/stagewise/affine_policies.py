@@ -603,10 +603,7 @@ def affine_plan(
     to be symmetric about zero. Works inside jit and vmap."""
     mpc, s, E, aim = _without_derivative((mpc, s, E, aim))
     dtype, n = E.dtype, mpc.system.n
-    center, Gamma = generator_form(mpc.disturbance, dtype)
-    into = jnp.eye(n, dtype=dtype)
-    if mpc.disturbance_matrix is not None:
-        into = jnp.asarray(mpc.disturbance_matrix, dtype)
+    center, Gamma, into = generator_form(mpc, dtype)
     sound = all_finite((center, Gamma, into))
     fault = jnp.where((fault == Status.NOT_RUN) & ~sound, jnp.int32(Status.NON_FINITE), fault)
     center, Gamma, into = jax.tree.map(lambda v: jnp.where(sound, v, 0.0), (center, Gamma, into))
