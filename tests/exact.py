@@ -161,6 +161,11 @@ class Polygon:
         normals = [(q[1] - p[1], p[0] - q[0]) for p, q in zip(v, v[1:] + v[:1], strict=True)]
         return [(a, dot(a, p)) for a, p in zip(normals, v, strict=True)]
 
+    def rows(self) -> tuple:
+        """(a, b) of the facets, (k, 2) and (k,), rounded to floats."""
+        a, b = zip(*self.facets, strict=True)
+        return np.array(a, float), np.array(b, float)
+
     def support(self, a) -> Q:
         """Exact maximum of a'x."""
         a = rational(a)

@@ -159,8 +159,7 @@ def test_boundary(planar):
 
 def exits(polygon, center, directions):
     """Where the rays leave the polygon."""
-    a = np.array([[float(v) for v in a] for a, _ in polygon.facets])
-    b = np.array([float(b) for _, b in polygon.facets])
+    a, b = polygon.rows()
     with np.errstate(divide="ignore"):
         t = (b - a @ center) / (directions @ a.T)
     return np.where(directions @ a.T > 0, t, np.inf).min(axis=1)
@@ -227,8 +226,7 @@ def product_facets(blocks):
     """a (34, 4), b (34,)."""
     parts = []
     for i, block in enumerate(blocks):
-        a = np.array([[float(v) for v in a] for a, _ in block.facets])
-        b = np.array([float(b) for _, b in block.facets])
+        a, b = block.rows()
         parts.append((a @ problems.T_INVERSE[2 * i : 2 * i + 2], b))
     return tuple(np.concatenate(p) for p in zip(*parts, strict=True))
 

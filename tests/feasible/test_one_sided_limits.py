@@ -113,8 +113,7 @@ def near(polygon, center, count) -> np.ndarray:
     """Points on rays from `center`, on both sides of the boundary by 1e-3, 1e-6, 1e-9 of it."""
     angle = np.random.default_rng(0).uniform(0, 2 * np.pi, count)
     rays = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    a = np.array([[float(v) for v in a] for a, _ in polygon.facets])
-    b = np.array([float(b) for _, b in polygon.facets])
+    a, b = polygon.rows()
     slope = rays @ a.T
     with np.errstate(divide="ignore"):
         t = np.where(slope > 0, (b - a @ center) / slope, np.inf).min(axis=1)

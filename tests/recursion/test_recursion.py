@@ -365,17 +365,13 @@ class TestReport:
         if not search:
             return
         # No vertex of X_N and no state between leads farther, by another solver.
-        body = exact.feasible_polygon(mpc)
-        H = np.array([[float(v) for v in a] for a, _ in body.facets])
+        H, h = exact.feasible_polygon(mpc).rows()
         size = np.linalg.norm(H, axis=1)
-        h = np.array([float(b) for _, b in body.facets]) / size
         corners = np.asarray(report.feasible_set.vertices())
         weights = np.random.default_rng(0).dirichlet(np.full(len(corners), 0.3), 150)
+        step = lambda x: mpc.system.A @ x + mpc.system.B @ problems.least_distance(mpc, x)[0]
         beyond = [
-            (
-                H @ (mpc.system.A @ x + mpc.system.B @ problems.least_distance(mpc, x)[0]) / size
-                - h
-            ).max()
+            ((H @ step(x) - h) / size).max()
             for x in [*corners * (1 - 1e-9), *weights @ corners * (1 - 1e-9)]
         ]
         assert c.distance - 0.1 * c.distance < max(beyond) < c.distance + 1e-6
