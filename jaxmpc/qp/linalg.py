@@ -304,6 +304,8 @@ def _solve_plain(K: Array, B: Array) -> Array:
 
 
 _cholesky_lapack = partial(lax.linalg.cholesky, symmetrize_input=False)
+_triangular_lapack = partial(lax.linalg.triangular_solve, left_side=True, lower=True)
+_transposed_lapack = partial(_triangular_lapack, transpose_a=True)
 
 
 def _cholesky_in_blocks(K: Array) -> Array:
@@ -318,14 +320,6 @@ def _cholesky_in_blocks(K: Array) -> Array:
     return jnp.block([[L, jnp.zeros((h, n - h), K.dtype)], [X, rest]])
 
 
-def _triangular_lapack(L: Array, B: Array) -> Array:
-    return lax.linalg.triangular_solve(L, B, left_side=True, lower=True)
-
-
-def _transposed_lapack(L: Array, B: Array) -> Array:
-    return lax.linalg.triangular_solve(L, B, left_side=True, lower=True, transpose_a=True)
-
-
 def _in_parts(solve: Callable, L: Array, B: Array) -> Array:
     """Return solve(L, B) by calls with as many columns as one thread of OpenBLAS solves for."""
     n, k = B.shape
@@ -338,8 +332,7 @@ def _in_parts(solve: Callable, L: Array, B: Array) -> Array:
     return jnp.moveaxis(X, 0, 1).reshape(n, -1)[:, :k]
 
 
-def _triangular_in_parts(L: Array, B: Array) -> Array:
-    return _in_parts(_triangular_lapack, L, B)
+_triangular_in_parts = partial(_in_parts, _triangular_lapack)
 
 
 def _solve_lapack(K: Array, B: Array) -> Array:
