@@ -8,6 +8,7 @@ import jax
 import numpy as np
 import problems
 import pytest
+from plants import DOUBLE, JOINT, UNSTABLE
 from polytopes import interval
 from problems import symmetric
 
@@ -22,16 +23,7 @@ from jaxmpc.sets.predecessors import one_step
 INF = np.inf
 
 
-JOINT = LinearSystem(np.array([[1, 0.01], [0, 1]]), np.array([[0], [0.2]]), dt=0.01)
-
-
-DOUBLE = LinearSystem([[1, 1], [0, 1]], [[1], [0.5]])
-
-
 LECTURE = LinearSystem([[1, 1], [0, 1]], [[0.4], [1]])
-
-
-UNSTABLE = LinearSystem([[2.0]], [[1.0]])
 
 
 @pytest.mark.parametrize(

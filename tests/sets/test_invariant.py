@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from plants import DOUBLE, JOINT, JOINT_LQR
 from polytopes import assert_same_points, interval
 from problems import symmetric
 
@@ -13,17 +14,7 @@ from jaxmpc.sets.invariant import invariant_ellipsoid
 INF = np.inf
 
 
-# A robot joint (inertia 0.05, 10 ms) and the double integrator of MPT3's test suite, with
-# O_inf of their LQR from an exact rational recursion.
-JOINT = LinearSystem(np.array([[1, 0.01], [0, 1]]), np.array([[0], [0.2]]), dt=0.01)
-
-
-JOINT_LQR = (JOINT, np.diag([50.0, 1.0]), np.array([[0.1]]))
-
-
-DOUBLE = LinearSystem([[1, 1], [0, 1]], [[1], [0.5]], dt=1.0)
-
-
+# Vertices of O_inf of JOINT_LQR, from an exact rational recursion.
 JOINT_O_INF = [
     [-0.3687944010552624, 1.4496977336585621],
     [0.20831143418682585, -2.0],

@@ -2,13 +2,12 @@
 
 import numpy as np
 import pytest
+from plants import UNSTABLE
 from polytopes import interval
 from problems import symmetric
 
 from jaxmpc import Box, LinearSystem, Polytope
 from jaxmpc.sets.predecessors import predecessor
-
-UNSTABLE = LinearSystem([[2.0]], [[1.0]])
 
 
 def test_predecessor_on_the_line():

@@ -5,6 +5,7 @@ from fractions import Fraction
 import exact
 import numpy as np
 import pytest
+from plants import JOINT, UNSTABLE
 from problems import symmetric
 
 from jaxmpc import Box, LinearSystem, lqr, maximal_invariant_set
@@ -16,12 +17,6 @@ from jaxmpc.sets.invariant import invariant_ellipsoid
 from jaxmpc.sets.terminal_hypotheses import _exact_factor, _Loop, _Rows, verify_terminal
 
 INF = np.inf
-
-
-JOINT = LinearSystem(np.array([[1, 0.01], [0, 1]]), np.array([[0], [0.2]]), dt=0.01)
-
-
-UNSTABLE = LinearSystem([[2.0]], [[1.0]])
 
 
 def joint_arguments(terminal_set, **changes):

@@ -6,17 +6,11 @@ from fractions import Fraction
 import jax
 import numpy as np
 import pytest
+from plants import JOINT, JOINT_LQR
 
 from jaxmpc import LinearSystem, lqr
 from jaxmpc.systems.riccati import cost_of_law, least_reached
 from jaxmpc.systems.units import natural_units
-
-# A robot joint (inertia 0.05, 10 ms) and the double integrator of MPT3's test suite, with
-# O_inf of their LQR from an exact rational recursion.
-JOINT = LinearSystem(np.array([[1, 0.01], [0, 1]]), np.array([[0], [0.2]]), dt=0.01)
-
-
-JOINT_LQR = (JOINT, np.diag([50.0, 1.0]), np.array([[0.1]]))
 
 
 def riccati_residual(system, Q, R, P):

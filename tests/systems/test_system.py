@@ -9,23 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy
+from plants import DOUBLE, JOINT
+from polytopes import cube
 
-from jaxmpc import Box, LinearSystem, Polytope
+from jaxmpc import Box, LinearSystem
 from jaxmpc.systems.riccati import LQR
 
 INF = np.inf
-
-
-# A robot joint (inertia 0.05, 10 ms) and the double integrator of MPT3's test suite, with
-# O_inf of their LQR from an exact rational recursion.
-JOINT = LinearSystem(np.array([[1, 0.01], [0, 1]]), np.array([[0], [0.2]]), dt=0.01)
-
-
-DOUBLE = LinearSystem([[1, 1], [0, 1]], [[1], [0.5]], dt=1.0)
-
-
-def cube(n, half=1.0):
-    return Polytope(np.vstack([np.eye(n), -np.eye(n)]), np.full(2 * n, half))
 
 
 def test_system_takes_lists_and_resolves_labels():
