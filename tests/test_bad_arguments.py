@@ -44,6 +44,26 @@ ROBUST = mpc(disturbance=jm.Box(-0.01, 0.01), disturbance_matrix=B, gain=np.zero
 TASK = jm.mpc.Task(lambda point: point.x[0], weight=1.0)
 
 
+def LOSS(run):  # noqa: N802
+    return run.states[0, 0]
+
+
+def solver(x0s=None, **more):
+    x0s = np.zeros((12, 2)) if x0s is None else x0s
+    return jm.tuning.tune_solver(M, x0s, 10, stages=2, **more)
+
+
+def trade_off(losses=None, **more):
+    losses = {"a": LOSS, "b": LOSS} if losses is None else losses
+    given = {"Q": jm.Parameter(np.eye(2), "diagonal")}
+    make = lambda v: dataclasses.replace(M, Q=v["Q"])
+    return jm.tuning.trade_off(make, given, S, np.zeros((8, 2)), losses, 3, **more)
+
+
+def exported(platforms):
+    return jm.export.export_jax(M, "nowhere.jax", platforms=platforms)
+
+
 def worst(x0):
     law = jm.closed_loop.LinearFeedback(ROBUST, np.zeros((1, 2)))
     return worst_disturbance(law, np.reshape(x0, (-1, 2)) if x0 == [] else x0, 3)
@@ -742,6 +762,21 @@ CALLS = [
     ("seconds: (). Give a time limit in", lambda: jm.explicit.critical_regions(M, seconds=())),
     ("seconds: (). Give a time limit in", lambda: jm.explicit.exact_penalty(M, seconds=())),
     ("rho: 'x' where real numbers are needed.", lambda: jm.explicit.exact_penalty(M, rho="x")),
+    ("x0s: entries of type <U1 where real", lambda: solver([["a", "b"]] * 12)),
+    ("solver: is a str. Give a jm.ADMM", lambda: solver(solver="admm")),
+    ("warm_start: 3 is none of them. Give a pair", lambda: solver(warm_start=3)),
+    ("validation: 'x' where real numbers are", lambda: solver(validation="x")),
+    ("weights: entries of type complex128 where", lambda: trade_off(weights=[[1j, 1.0]])),
+    ("losses['b']: is an int. Give a function of", lambda: trade_off(losses={"a": LOSS, "b": 3})),
+    ("lower: 'a' where real numbers are needed.", lambda: jm.Parameter(1.0, "interval", "a", 2)),
+    ("name: 3. Give letters, digits and _", lambda: jm.export.export_c(M, "nowhere", name=3)),
+    ("folder: is a NoneType. Give the path", lambda: jm.export.export_c(M, None)),
+    ("platforms: 'cpu'. Give a tuple of some of", lambda: exported("cpu")),
+    ("platforms: ('tpuu',). Give a tuple of some", lambda: exported(("tpuu",))),
+    (
+        "lower: [0, 1] exceeds upper [1, 0]. Give",
+        lambda: jm.export.check_fixed_steps(M, jm.ADMM(10), [0, 1], [1, 0]),
+    ),
     ("mpc: is a LinearFeedback. Give a jm.MPC", lambda: draw_disturbances(LAW, 3, 2)),
     ("controller: is an MPC. Give a Controller", lambda: worst_disturbance(M, x, 3)),
     ("x0: shape (0, 2). Give (B, 2), B ≥ 1", lambda: worst([])),

@@ -1,5 +1,6 @@
 """Tables and files of C code."""
 
+import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -7,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxmpc.checks import fail, number
+from jaxmpc.checks import fail, number, require_kind
 from jaxmpc.files import open_folder, require_new, versions
 from jaxmpc.mpc.plan import rate_ends
 from jaxmpc.mpc.problem import MPC, at_stage
@@ -56,7 +57,8 @@ class CFiles:
         Raises ValueError for names that C does not take, types that are not offered, a tolerance
         that is not positive, and files that exist, unless overwrite.
         """
-        if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
+        require_kind("folder", folder, str, os.PathLike, cure="Give the path of a folder")
+        if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
             fail("name", f"{name!r}", "Give letters, digits and _, a letter first")
         if name in HEADERS:
             fail("name", f"{name!r}", f"{name}.h is a header of C: give another name")

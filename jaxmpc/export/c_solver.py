@@ -22,6 +22,7 @@ from jaxmpc.checks import (
     require_kind,
     require_shape,
     require_untraced,
+    shown,
     whole,
 )
 from jaxmpc.export.c_files import GIVE_PROBLEM, CFiles, input_limits, literal
@@ -242,10 +243,13 @@ class ClosedLoopCheck:
 
 
 def require_box(mpc: MPC, lower: Any, upper: Any) -> None:
-    """Raise ValueError where the corners of a box of states are not (n,) finite numbers each."""
+    """Raise ValueError where the corners of a box of states are not (n,) finite numbers each, in
+    this order."""
     for argument, bound in (("lower", lower), ("upper", upper)):
         require_shape(argument, bound, (mpc.system.n,), "Give a number for each state")
         require_finite(argument, bound)
+    if np.any(np.asarray(lower) > np.asarray(upper)):
+        fail("lower", f"{shown(lower)} exceeds upper {shown(upper)}", "Give lower, then upper")
 
 
 def solved_by_code(controller: Controller, plan: Plan, tolerance: Any) -> Any:

@@ -13,6 +13,7 @@ from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.admm import ADMM
 
 PLATFORMS = ("cpu", "cuda")
+KNOWN = (*PLATFORMS, "rocm", "tpu")
 
 
 def export_jax(
@@ -36,7 +37,7 @@ def export_jax(
     of `solve`. The instances of a batch take their Newton steps together, in one
     group. JAX promises that later releases read the file for at least six months.
 
-    platforms: on which the file runs, lower-case names of JAX. Returns the path. Raises ValueError
+    platforms: on which the file runs: of cpu, cuda, rocm, tpu. Returns the path. Raises ValueError
     for an invalid problem and a file that exists, unless overwrite; ImportError without flatbuffers
     (the extra `export`).
     """
@@ -47,6 +48,9 @@ def export_jax(
     require_kind("solver", solver, ADMM)
     if dtype not in ("float64", "float32"):
         fail("dtype", f"{dtype!r}", 'Give "float64" or "float32"')
+    if isinstance(platforms, str) or not platforms or not set(platforms) <= set(KNOWN):
+        cure = f"Give a tuple of some of {', '.join(map(repr, KNOWN))}, such as ('cpu',)"
+        fail("platforms", f"{platforms!r}", cure)
     try:
         jax.devices("cpu")
     except RuntimeError:

@@ -17,7 +17,7 @@ import optax
 from tqdm.std import tqdm
 
 from jaxmpc.batches import chosen_devices
-from jaxmpc.checks import fail, nearest, shown, whole
+from jaxmpc.checks import fail, nearest, number, shown, whole
 from jaxmpc.files import fingerprint, read_arrays, remove_partial, write_arrays
 from jaxmpc.pytrees import record
 from jaxmpc.qp.linalg import float64_arrays
@@ -74,8 +74,11 @@ class Settings:
         whole("seed", self.seed, 0)
         if self.batch is not None:
             whole("batch", self.batch, 1)
-        if self.splits and not 0 < float(self.validation) < 1:
-            fail("validation", f"{self.validation}", "Give a fraction in (0, 1), or samples")
+        cure = "Give a fraction in (0, 1), or samples"
+        if self.splits:
+            number("validation", self.validation, 0, cure)
+            if not 0 < float(self.validation) < 1:
+                fail("validation", f"{self.validation}", cure)
         if not isinstance(self.optimizer, optax.GradientTransformation | None):
             cure = "Give one of optax, such as optax.adam(0.05)"
             fail("optimizer", f"{shown(self.optimizer)} is no optimizer", cure)

@@ -71,8 +71,8 @@ class Parameter:
         object.__setattr__(self, "value", value)
         if self.domain == "interval":
             for name in ("lower", "upper"):
+                require_finite(name, getattr(self, name))
                 end = np.asarray(getattr(self, name), np.float64)
-                require_finite(name, end)
                 if end.shape not in ((), value.shape):
                     fail(name, f"shape {end.shape}", f"Give a number or shape {value.shape}")
                 object.__setattr__(self, name, end)

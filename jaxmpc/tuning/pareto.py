@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from jaxmpc.arrays import Reals
-from jaxmpc.checks import fail, require_finite, whole
+from jaxmpc.checks import fail, require_finite, require_real, whole
 from jaxmpc.closed_loop.simulation import Run
 from jaxmpc.pytrees import record
 from jaxmpc.tuning.descent import Settings
@@ -100,6 +100,9 @@ def trade_off(
     """
     if not isinstance(losses, Mapping) or len(losses) < 2:
         fail("losses", f"is {losses!r}", 'Give two or more, {"tracking": ..., "effort": ...}')
+    for name, function in losses.items():
+        if not callable(function):
+            fail(f"losses[{name!r}]", f"is a {type(function).__name__}", "Give a function of a Run")
     given = _given_weights(weights, len(losses))
     known = ("reference", "input_reference", "variations", "conditions", "solver", "design_loss")
     fixed = {name: options.pop(name) for name in (*known, "mode") if name in options}
@@ -132,6 +135,7 @@ def trade_off(
 
 def _given_weights(weights: int | Reals, count: int) -> int | np.ndarray:
     """Return weights (K, L), or the number of points, as given."""
+    require_real("weights", weights)
     found = np.asarray(weights)
     if found.ndim == 0:
         if count > 2:

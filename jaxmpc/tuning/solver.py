@@ -28,7 +28,7 @@ from scipy.linalg import block_diag
 
 from jaxmpc.arrays import Reals
 from jaxmpc.batches import Compiled, Devices, chosen_devices, divisible, each_part, over_devices
-from jaxmpc.checks import fail, require_finite, require_kind, whole
+from jaxmpc.checks import fail, require_finite, require_kind, require_real, shown, whole
 from jaxmpc.files import fingerprint
 from jaxmpc.mpc.condense import condensed_in_float64, in_float64
 from jaxmpc.mpc.controller import Controller, plan_with, stated_terms, with_solver
@@ -103,6 +103,11 @@ def tune_solver(
     """
     chosen = Settings.of("tune_solver", {"updates": 200, "batch": 32, **settings})
     chosen.validate()
+    require_real("x0s", x0s)
+    pair = isinstance(warm_start, tuple) and len(warm_start) == 2
+    if not (pair or warm_start is None or isinstance(warm_start, Plan | WarmStart)):
+        cure = "Give a pair (z, y) of arrays, or plans, of all states"
+        fail("warm_start", f"{shown(warm_start)} is none of them", cure)
     solver = SOLVER if solver is None else solver
     references = reference, input_reference
     objective = _objective(mpc, iterations, stages, groups, solver, references)
@@ -239,6 +244,7 @@ def _objective(
 ) -> "PenaltyObjective":
     """Return the objective; ValueError for bad input."""
     require_kind("mpc", mpc, MPC)
+    require_kind("solver", solver, ADMM)
     mpc.validate()
     if whole("iterations", iterations, 1) % whole("stages", stages, 1):
         fail("iterations", f"{iterations} for {stages} stages", "Use a multiple")
@@ -328,6 +334,7 @@ def _warm_starts(controller: Controller, x: np.ndarray, given: Any) -> WarmStart
 
 def _states(mpc: MPC, name: str, x0s: Reals) -> np.ndarray:
     """Return states (B, n), or (B, n + m) with the previous inputs, with zeros for these."""
+    require_real(name, x0s)
     x = np.asarray(x0s, np.float64)
     if x.ndim != 2 or x.shape[1] not in (mpc.system.n, mpc.dimension) or not len(x):
         fail(name, f"shape {x.shape}", f"Give states (B, {mpc.system.n})")

@@ -96,6 +96,11 @@ KEYS = [
     ('["p", "v"]', '["p", "v"]\ninput_names = ["u", "w"]', "system.input_names"),
     ("x_min = [-5.0, -5.0]", "x_min = [true, -5.0]", "limits.x_min"),
     ("x_min = [-5.0, -5.0]", 'x_min = ["-5", -5.0]', "limits.x_min"),
+    (
+        "u_min = [-1.0]\nu_max = [1.0]",
+        "u_min = [0.30000000000000004]\nu_max = [0.3]",
+        "limits.u_min: entry 0 is 0.30000000000000004, above u_max 0.3",
+    ),
     ("x_min = [-5.0, -5.0]", "x_min = 6.0", "limits.x_min: entry 0 is 6, above x_max 5"),
     ("x_min = [-5.0, -5.0]", "x_min = [nan, -5.0]", "limits.x_min: is NaN"),
     ("x_min = [-5.0, -5.0]", "x_min = [-5.0]", "limits.x_min: has 1 entries where 2"),

@@ -457,5 +457,6 @@ def _check_order(where: str, section: Any, low: str, high: str) -> None:
     pairs = zip(getattr(section, low) or (), getattr(section, high) or (), strict=False)
     for i, (a, b) in enumerate(pairs):
         if a > b or (where in SECTION_COMMANDS and a == b):
-            what = f"entry {i} is {a:g}, above {high} {b:g}"
+            low_end, high_end = (repr(v).removesuffix(".0") for v in (a, b))  # all their digits
+            what = f"entry {i} is {low_end}, above {high} {high_end}"
             fail(f"{where}.{low}", what, f"Check {low}, {high}")

@@ -214,6 +214,8 @@ KEYS = {
     **{name: f"system.{name}" for name in ("A", "B", "c", "dt", "state_names", "state_units")},
     **{name: f"system.{name}" for name in ("input_names", "input_units", "time_unit")},
     "mpc.soft": "cost.rho",
+    "rho": "solver.rho",
+    "iterations": "solver.iterations",
     "Q": "cost.Q",
     "R": "cost.R",
     "terminal_cost": "cost.P",
@@ -441,13 +443,16 @@ class Config:
             rho = exact_penalty(mpc, **self.references()).advised
         return soften(mpc, rho)
 
+    @_in_keys
     def build_solver(self) -> ADMM | None:
         """Return the solver of [solver]; None without that section."""
         if self.solver is None:
             return None
         given = self.solver.rho
         rho = np.asarray(given) if isinstance(given, tuple) else given
-        return ADMM(self.solver.iterations, rho, self.solver.alpha, self.solver.newton_steps)
+        found = ADMM(self.solver.iterations, rho, self.solver.alpha, self.solver.newton_steps)
+        found.validate()
+        return found
 
     def state_limits(self) -> Box | Polytope | None:
         """Return the state limits without the margin; None where there are none."""
