@@ -154,9 +154,12 @@ def roll_out(p: ExactData, x: Array, inputs: Array, moved: Array) -> tuple[Array
         here = jnp.concatenate([x, u]), jnp.concatenate([error, u_error])
         found = holds(jnp.concatenate([H, D], axis=1), lower, upper, solved, *here)
         # Twice the first-order bound covers the rounding of the bound itself. A state that stays as
-        # it is, or takes the value of another one or of an input, is not rounded.
-        copied = row_gamma(jnp.concatenate([A, B, c[:, None]], axis=1)) == 0
-        copied = copied & (c == 0)
+        # it is, or takes the value of another one or of an input, is not rounded: one whose terms
+        # are zero but for one of an entry ±1.
+        M, v = jnp.concatenate([A, B], axis=1), here[0]
+        moving = (v != 0).astype(v.dtype)
+        scaled = jnp.where((M == 0) | (jnp.abs(M) == 1), 0.0, 1.0) @ moving
+        copied = (c == 0) & (scaled == 0) & ((M != 0).astype(v.dtype) @ moving <= 1)
         growth, tiny = jnp.where(copied, 0.0, 2 * gamma(n + m + 2)), jnp.where(copied, 0.0, TINY)
         bound = jnp.abs(A) @ jnp.abs(x) + jnp.abs(B) @ jnp.abs(u) + jnp.abs(c)
         error = jnp.abs(A) @ error + jnp.abs(B) @ u_error

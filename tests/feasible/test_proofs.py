@@ -92,6 +92,26 @@ class TestProofs:
                 if proved:
                     assert exact.keeps_all_rows(mpc, x0, clipped)
 
+    def test_sums_of_one_term_are_not_rounded(self):
+        """A chain of integrators at rest on a limit stays there, exactly; what is proved is so in
+        rationals, whichever states and inputs are zero."""
+        n, N, rng = 3, 5, np.random.default_rng(0)
+        chain, some = np.eye(n) + 0.1 * np.eye(n, k=1), 0
+        for trial in range(12):
+            A = chain if trial == 0 else rng.choice([0, 1, -1, 0.3, 1 + 2.0**-52], (n, n))
+            B = np.eye(n)[:, -1:] * 0.1 if trial == 0 else rng.choice([0, 1, 0.7], (n, 1))
+            sides = jm.Box(-np.ones(n), np.ones(n))
+            mpc = jm.MPC(jm.LinearSystem(A, B), np.eye(n), 1, N, sides, jm.Box(-1, 1))
+            states = rng.choice([0, 0, 1, -1, 0.3, 1 - 2.0**-53], (60, n))
+            plans = rng.choice([0, 0, 0, -0.1, 0.3], (60, N, 1))
+            with enable_x64(True):
+                prove = jax.jit(jax.vmap(prover(exact_form(mpc, np.ones(n)))))
+                proved, clipped = prove(states, plans)
+            for x, u in zip(states[proved], np.asarray(clipped)[proved], strict=True):
+                assert exact.keeps_all_rows(mpc, x, u)
+            some += np.count_nonzero(np.abs(states[proved]).max(axis=1) == 1)
+        assert some > 20
+
     def test_empty_set_cut(self):
         """0'θ ≤ b < 0 excludes every point, and only then may a normal be zero."""
         got = jm.map_feasible_set(EMPTY, np.zeros((1, 2)))

@@ -78,6 +78,17 @@ def test_a_flat_terminal_set_of_many_states_is_no_flat_feasible_set():
         feasible_growth(mpc, [6])
 
 
+def test_a_grid_that_ends_at_the_limits_is_decided():
+    """Of a chain of integrators by Euler's rule: each label is that of a linear program."""
+    system = jm.LinearSystem(np.eye(4) + 0.1 * np.eye(4, k=1), 0.1 * np.eye(4)[:, 3:])
+    sides = jm.Box(-np.ones(4), np.ones(4))
+    mpc = jm.MPC(system, np.eye(4), 0.1, 5, states=sides, inputs=jm.Box(-1, 1))
+    fmap = jm.map_feasible_set(mpc, jm.grid([-1, -1], [1, 1], 5), axes=[0, 1], fixed=[0, 0])
+    states = np.pad(fmap.x0s, ((0, 0), (0, 2)))
+    assert np.all(np.abs(fmap.label) == 1)
+    np.testing.assert_array_equal(jm.solve_many(mpc, states).solved, fmap.label == 1)
+
+
 def limited(place, low, high):
     """Return the problem with one coordinate, or all of the last state, between low and high."""
     sides, n = np.array([[low, high], [-1.0, 1.0]]), np.eye(2)
