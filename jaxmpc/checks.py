@@ -192,6 +192,8 @@ def require_real(argument: str, value: Any) -> None:
     if array.dtype.kind not in "biuf" and array.dtype.name != "bfloat16":
         found = shown(value) if np.ndim(array) == 0 else f"entries of type {array.dtype}"
         cure = "Give an array or nested lists of them"
+        if type(value).__name__ == "LQR":
+            cure = "Its gain is .K, its cost .P"
         if np.ndim(array) and array.dtype.kind in "OSU":
             cure = "Make numbers of them: np.asarray(..., dtype=float)"
         fail(argument, f"{found} where real numbers are needed", cure)

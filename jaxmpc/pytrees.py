@@ -7,7 +7,7 @@ import functools
 import inspect
 import textwrap
 from collections.abc import Callable, Iterable
-from typing import Any, TypeVar, dataclass_transform
+from typing import Any, NoReturn, TypeVar, dataclass_transform
 
 import jax
 import numpy as np
@@ -35,6 +35,8 @@ def record(cls: T) -> T:
     cls.__init__ = _naming_arguments(cls.__init__)  # type: ignore[misc]
     if cls.__repr__ is object.__repr__:
         cls.__repr__ = short_text  # type: ignore[method-assign, assignment]
+    if not hasattr(cls, "__getattr__"):
+        cls.__getattr__ = _absent  # type: ignore[attr-defined]
     if cls.__getstate__ is object.__getstate__:
         cls.__getstate__ = _given  # type: ignore[method-assign, assignment]
     return cls
@@ -44,6 +46,32 @@ def _given(instance: Any) -> dict[str, Any]:
     """Return what copies and pickles of a record hold: its fields. What it keeps beside them, such
     as compiled programs and their locks, is made again from these when it is next used."""
     return {f.name: getattr(instance, f.name) for f in dataclasses.fields(instance)}
+
+
+# Names that other libraries give to attributes.
+ATTRIBUTES = {
+    "x": "states",
+    "u": "inputs",
+    "y": "multipliers",
+    "N": "horizon",
+    "objective": "cost",
+    "V": "vertices",
+    "A": "H",
+    "b": "h",
+    "feasible": "label",
+    "labels": "label",
+}
+
+
+def _absent(instance: Any, name: str) -> NoReturn:
+    """Raise AttributeError with what another library's name of an attribute is called here."""
+    cls = type(instance)
+    if hasattr(cls, name):  # a property, which raised: once more, for its own error
+        object.__getattribute__(instance, name)
+    own, meant = [f.name for f in dataclasses.fields(cls)], ATTRIBUTES.get(name)
+    hint = f". Did you mean {meant}?" if meant in own or hasattr(cls, meant or "_") else ""
+    text = f"{cls.__name__!r} object has no attribute {name!r}{hint}"
+    raise AttributeError(text, name=name, obj=instance)
 
 
 def _naming_arguments(make: Callable[..., None]) -> Callable[..., None]:

@@ -108,7 +108,7 @@ assert true_loss(after) < true_loss(before), "What we meant is better after tuni
 # nothing about the motion. Weights that are tuned must not measure the result.
 
 # %% [markdown]
-# ## $\rho$ number one: the penalty of soft limits
+# ## The first rho: the penalty of soft limits
 #
 # `soften(mpc, rho)` lets the state limits be exceeded and charges $\rho \cdot$ (violation). This
 # $\rho$ changes the *answer*. Above a threshold $\bar\rho$, the largest multiplier of the hard
@@ -135,7 +135,7 @@ assert min(slack[:3]) > 1e-4, "Below the threshold there is slack."
 assert max(slack[4:]) < 1e-5, "Above it there is none."
 
 # %% [markdown]
-# ## $\rho$ number two: the step size of ADMM
+# ## The second rho: the step size of ADMM
 #
 # ADMM's $\rho$ weighs the distance between its two copies of the variables. It changes nothing
 # about the problem: with enough iterations every $\rho > 0$ ends at the same plan. It

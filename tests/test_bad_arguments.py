@@ -762,6 +762,14 @@ CALLS = [
     ("seconds: (). Give a time limit in", lambda: jm.explicit.critical_regions(M, seconds=())),
     ("seconds: (). Give a time limit in", lambda: jm.explicit.exact_penalty(M, seconds=())),
     ("rho: 'x' where real numbers are needed.", lambda: jm.explicit.exact_penalty(M, rho="x")),
+    ("factor: is a Polytope. P.cartesian_product", lambda: BOX * BOX.to_polytope()),
+    ("rho: 'exact'. Give a number: jm.explicit", lambda: jm.soften(M, "exact")),
+    ("c: 0.01 where (2,) is needed. Give one", lambda: jm.LinearSystem(A, B, 0.01)),
+    (
+        "K: LQR(K=[[",
+        lambda: jm.maximal_invariant_set(S, jm.lqr(S, np.eye(2), 1), BOX, M.inputs),
+    ),
+    ("x0s: shape (4, 1). Give points (B, 2), one", lambda: jm.map_feasible_set(M, np.eye(4)[:1].T)),
     ("x0s: entries of type <U1 where real", lambda: solver([["a", "b"]] * 12)),
     ("solver: is a str. Give a jm.ADMM", lambda: solver(solver="admm")),
     ("warm_start: 3 is none of them. Give a pair", lambda: solver(warm_start=3)),
@@ -947,6 +955,11 @@ def test_arguments_that_do_not_exist_or_are_missing(message, call):
     assert str(told.value).startswith(message)
 
 
+def test_a_misspelt_argument_of_a_design_is_named_before_any_work():
+    with pytest.raises(TypeError, match="design: there is no argument limts. Did you mean limits"):
+        jm.design(S, np.eye(2), np.eye(1), 3, limts=1)
+
+
 @pytest.mark.parametrize(
     ("found", "value"),
     [
@@ -983,6 +996,28 @@ def test_a_plant_of_other_arguments_is_told_its_own(plant):
         jm.simulate(LAW, plant, x, 3)
     with pytest.raises(ValueError, match="model or task: cannot be called .* in this order"):
         jm.mpc.solve_nonlinear(jm.mpc.NonlinearMPC(M, plant), x)
+
+
+@pytest.mark.parametrize(
+    ("instance", "name", "meant"),
+    [(M, "N", "horizon"), (BOX.to_polytope(), "V", "vertices"), (LAW, "u", None)],
+)
+def test_attributes_of_other_libraries_are_told_what_they_are_called_here(instance, name, meant):
+    hint = "" if meant is None else rf"\. Did you mean {meant}\?"
+    with pytest.raises(AttributeError, match=rf"object has no attribute '{name}'{hint}$"):
+        getattr(instance, name)
+    assert not hasattr(instance, name)
+
+
+def test_an_error_inside_a_property_stays_what_it_is():
+    @record
+    class Broken:
+        @property
+        def half(self):
+            return (1).nothing
+
+    with pytest.raises(AttributeError, match="'int' object has no attribute 'nothing'"):
+        Broken().half  # noqa: B018
 
 
 def test_errors_inside_a_constructor_stay_what_they_are():

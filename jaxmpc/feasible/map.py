@@ -462,6 +462,9 @@ def _require_points(problem: FeasibilityProblem, points: np.ndarray) -> None:
             n = problem.mpc.system.n
             columns = f"points (B, {d}): states, then previous inputs, for rates are limited; or "
             columns += f"map a slice: axes={list(range(n))}, fixed={[0] * (d - n)}"
+        elif points.ndim == 2 and 0 < points.shape[1] < d:
+            k = points.shape[1]
+            columns += f"; or map a slice: axes={list(range(k))}, fixed={[0] * (d - k)}"
         fail("x0s", f"shape {points.shape}", f"Give {columns}")
 
 

@@ -49,7 +49,7 @@ HARD = ("system", "states", "inputs", "outputs", "input_rate_limit")
 # What makes the arguments that files may give by a name.
 MADE_BY = {
     "terminal_cost": "jm.lqr(system, Q, R).P is that of LQR",
-    "terminal_set": "jm.sets.named_terminal_set makes the set of a name",
+    "terminal_set": "jm.design(..., terminal=...) takes names and makes the problem",
 }
 # How inputs answer to disturbances: see `MPC`.
 POLICIES = ("tightened", "tube", "affine")
@@ -795,6 +795,8 @@ def soften(mpc: MPC, rho: Reals, quadratic: Reals = 0.0) -> MPC:
     """
     require_kind("mpc", mpc, MPC)
     mpc.validate()
+    if isinstance(rho, str) and rho == "exact":
+        fail("rho", f"{rho!r}", "Give a number: jm.explicit.exact_penalty(mpc).advised is exact")
     if isinstance(mpc.terminal_set, Ellipsoid):
         fail("terminal_set", "is an Ellipsoid, which stays hard", "Use a Polytope inside it")
     hard = []

@@ -654,7 +654,7 @@ class Box(LinearSet):
         empty = _misses(lower, upper)
         if empty.any():
             i = int(np.argmax(empty))
-            cure = "Give lower <= upper, with -inf below or inf above for no bound"
+            cure = "Give lower <= upper: all lower ends, then all upper ones, -inf or inf for none"
             ends = [f"{v:g}" for v in (lower[i], upper[i])]
             if ends[0] == ends[1]:  # apart by rounding
                 ends = [repr(float(v)) for v in (lower[i], upper[i])]

@@ -240,6 +240,9 @@ class BasicSet(ConvexSet):
         return self._times(-1.0)
 
     def __mul__(self, factor: Any) -> Any:
+        if isinstance(factor, BasicSet):
+            cure = "P.cartesian_product(Q) is that of two sets; P * 2.0 is a larger one"
+            fail("factor", f"is a {type(factor).__name__}", cure)
         require_real("factor", factor)
         if np.ndim(factor) or not np.isfinite(factor):
             cure = "Give a finite one; A @ P is the image under A"

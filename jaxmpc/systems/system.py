@@ -87,6 +87,9 @@ class LinearSystem:
         require_last("B", self.B, (n, self.m), "Give B as many rows as A")
         if dimensions(self.c):
             require_last("c", self.c, (n,), "Give one number a state, or None")
+        elif isinstance(self.c, int | float):
+            cure = f"Give one number a state; the sampling period has its name, dt={self.c!r}"
+            fail("c", f"{self.c!r} where ({n},) is needed", cure)
         for kind, count in (("state", n), ("input", self.m)):
             for what in (f"{kind}_names", f"{kind}_units"):
                 require_names(what, getattr(self, what), count)

@@ -1,10 +1,12 @@
 """From limits, weights and a horizon to an MPC problem with terminal set, cost and penalties."""
 
+import dataclasses
+import inspect
 from dataclasses import replace
 from typing import Any
 
 from jaxmpc.arrays import Reals
-from jaxmpc.checks import fail
+from jaxmpc.checks import fail, nearest
 from jaxmpc.explicit.exact_penalties import ExactPenalty, exact_penalty
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.problem import MPC, soften
@@ -65,6 +67,12 @@ def design(
 
     Raises ValueError for ill-posed data, as `lqr`, `maximal_invariant_set` and `MPC` do.
     """
+    known = [f.name for f in dataclasses.fields(MPC)]
+    for word in set(settings) - set(known):
+        near = nearest(word, [*inspect.signature(design).parameters, *known])
+        raise TypeError(
+            f"design: there is no argument {word}. {near}It takes the fields of MPC too"
+        )
     if limits is not None:
         if states is not None or inputs is not None:
             fail("limits", "given beside states or inputs", "Choose one way to give the limits")
