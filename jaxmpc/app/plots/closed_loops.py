@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
 
 from jaxmpc.app.plots.style import (
     AFTER,
@@ -204,6 +205,7 @@ def panel_grid(
         for ax, (kind, i, label) in zip(column, panels, strict=True):
             ax.set_ylabel(label, fontsize=8)
             ax.tick_params(labelsize=7)
+            ax.xaxis.set_major_locator(MaxNLocator(5))
             ax.set_xlim(0, time[-1])
             found.append((ax, kind, i))
         part.align_ylabels()

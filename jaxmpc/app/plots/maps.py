@@ -328,6 +328,10 @@ def _draw_losses(ax: Axes, report: RecursionReport) -> list[Artist]:
         name = f"{first}" if first == last else f"{first} to {last}"
         name = f"lost at step {name if last < np.inf else f'{first} or later'}"
         outcomes.append((name, colour, (lost >= first) & (lost <= last)))
+    if 0 < np.count_nonzero(lost > 0) < 0.01 * len(lost):  # too few to be seen as cells
+        for _, colour, where in outcomes[3:]:
+            x, y = report.loops.x0s[where].T
+            ax.scatter(x, y, s=14, color=colour, edgecolors="white", linewidths=0.4, zorder=3)
     return draw_outcomes(ax, report.loops.x0s, outcomes)
 
 
