@@ -210,7 +210,7 @@ fig.tight_layout()
 # %% [markdown]
 # ## Exercises
 #
-# 1. *(Lesson, Problem 2.)* For $x^+ = x + u$, $|u| \le u_{\max}$, which $x_0$ have a plan of $N$
+# 1. For $x^+ = x + u$, $|u| \le u_{\max}$, which $x_0$ have a plan of $N$
 #    steps, if $|x_k| \le x_{\max}$ is imposed at $k = 0, \dots, N$? At $k = 1, \dots, N$? At
 #    $k = N$ alone? Which of these is $|x_0| \le x_{\max} + N u_{\max}$?
 # 2. For $x^+ = 2x + u$, $|x| \le 5$, $|u| \le 1$ the feasible set is $|x| \le 1 + 4 \cdot 2^{-N}$.
@@ -218,7 +218,7 @@ fig.tight_layout()
 # 3. Give the cart a stronger drive, $|u| \le 0.3$ m/s, at $N = 3$. Which of the three claims hold?
 
 # %% [markdown]
-# **Answer 1.** The lesson's $x_{\max} + N u_{\max}$ is right only if the limit holds at $k = N$
+# **Answer 1.** $x_{\max} + N u_{\max}$ is right only if the limit holds at $k = N$
 # alone. With $k = 0$ among the steps, $x_0$ itself must keep the limit and nothing is gained; with
 # $k = 1, \dots, N$ one input may be spent before the first check.
 

@@ -152,7 +152,7 @@ fig.tight_layout()
 # %% [markdown]
 # ## Exercises
 #
-# 1. *(Lesson, Problem 5.)* Write the position limits of the arm as $G_x x \le g_x$ with
+# 1. Write the position limits of the arm as $G_x x \le g_x$ with
 #    $x = (q, \dot q)$, and check all states of the simulation with it.
 # 2. How many loops used at least 99 % of a torque limit, and how many came within 3 % of a
 #    velocity limit?

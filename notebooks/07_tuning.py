@@ -182,7 +182,7 @@ assert penalties.after["solved"] >= penalties.before["solved"], "It is not worse
 # %% [markdown]
 # ## Exercises
 #
-# 1. *(Lesson, Problem 3.)* Let the optimum without the limits keep the limits. Show on an example
+# 1. Let the optimum without the limits keep the limits. Show on an example
 #    that then the slack is zero for *any* soft penalty $\rho > 0$, however small.
 # 2. Multiply $Q$, $R$ and the terminal cost by ten. What happens to the plan, and to $\bar\rho$?
 # 3. Does the tuned ADMM change the plan? Compare with the default solver.

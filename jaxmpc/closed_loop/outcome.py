@@ -267,7 +267,8 @@ def _time_rows(s: dict[str, Any]) -> list[tuple[str, str]]:
 
 def _middle(levels: dict[str, float | None], missing: str, unit: str) -> str:
     """Return the levels in words."""
-    median, most = (
-        missing if v is None else f"{v:.4g}{unit}" for v in (levels["median"], levels["95 %"])
-    )
-    return f"median {median}, 95 % up to {most}"
+    median, most = levels["median"], levels["95 %"]
+    if median is None:
+        return f"more than half {missing}"
+    last = f"95 % up to {most:.4g}{unit}" if most is not None else f"more than 5 % {missing}"
+    return f"median {median:.4g}{unit}, {last}"
