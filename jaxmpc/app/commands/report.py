@@ -16,7 +16,7 @@ STYLE = (
     "body{font:16px/1.5 system-ui,sans-serif;max-width:60rem;margin:2rem auto;padding:0 1rem}"
     "table{border-collapse:collapse;margin:.5rem 0}td,th{text-align:left;vertical-align:top;"
     "padding:.15rem 1rem .15rem 0;border-bottom:1px solid #ddd;overflow-wrap:anywhere}"
-    "img{max-width:100%}pre{overflow-x:auto;background:#f6f6f6;padding:1rem}"
+    "img{max-width:100%}pre{white-space:pre-wrap;background:#f6f6f6;padding:1rem}"
     "h2,h3{margin-bottom:.2rem}"
 )
 
