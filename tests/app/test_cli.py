@@ -594,7 +594,7 @@ def test_verify_a_recursion_report(tmp_path, capsys):
     assert run("recursion --horizon 4 --grid 9 9 --lower -1.5 -2 --upper 1.5 2 --output rec") == 0
     assert run("verify rec") == 0
     out = capsys.readouterr().out
-    assert "rec/recursion.npz: verified" in out and "of 79," in out
+    assert "rec/recursion.npz: verified" in out and "of 81," in out
     summary = json.loads((tmp_path / "rec/summary.json").read_text())
     for key, word in (("next_state", "not A x + B u + c"), ("feasible_inputs", "breaks a limit")):
         wrong = json.loads(json.dumps(summary))

@@ -159,7 +159,8 @@ def test_penalties_write_a_solver_that_is_read_back(tmp_path, monkeypatch, capsy
             for solved, residual in ((0.25, 1e-2), (0.5, 1e-6))
         )
         settings = {"blocks": blocks, "given_rho": 0.6}
-        found = TuningRun({}, {}, before, after, True, settings, lambda _: solver)
+        given = {"alpha": 1.9}
+        found = TuningRun({}, given, before, after, True, settings, lambda _: solver)
         made.append(found)
         return found
 

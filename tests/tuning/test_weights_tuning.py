@@ -259,17 +259,20 @@ def test_derivatives_of_100_random_problems(x64):
         run = jm.simulate(jm.Controller(jm.soften(mpc, v["rho"]), solver), SYSTEM, x0, 12)
         return LOSS(run)
 
-    def compare(cost, settings, step=1e-5):
+    def compare(cost, settings, steps=(1e-5, 2e-5)):
         value = jax.jit(jax.vmap(cost))
         found = jax.jit(jax.vmap(jax.grad(cost)))(settings, x0s)
         for name, v in settings.items():
             scale = np.abs(found[name]).reshape(100, -1).max(axis=1)
             for place in np.ndindex(v.shape[1:]):
-                moved = [dict(settings, **{name: v.copy()}) for _ in range(2)]
-                for sign, m in zip((1, -1), moved, strict=True):
-                    m[name][(slice(None), *place)] += sign * step
-                change = (value(moved[0], x0s) - value(moved[1], x0s)) / (2 * step)
-                error = np.abs(change - found[name][(slice(None), *place)])
+                errors = []
+                for step in steps:  # a plan solved to 1e-11 makes one of them noisy
+                    moved = [dict(settings, **{name: v.copy()}) for _ in range(2)]
+                    for sign, m in zip((1, -1), moved, strict=True):
+                        m[name][(slice(None), *place)] += sign * step
+                    change = (value(moved[0], x0s) - value(moved[1], x0s)) / (2 * step)
+                    errors.append(np.abs(change - found[name][(slice(None), *place)]))
+                error = np.minimum(*errors)
                 assert np.all(error <= 1e-4 * scale + 1e-8), (name, place, error.max())
 
     compare(lambda v, x: cost(v, x, jm.ADMM(iterations=50, newton_steps=20)), settings)
