@@ -764,6 +764,10 @@ CALLS = [
     ("rho: 'x' where real numbers are needed.", lambda: jm.explicit.exact_penalty(M, rho="x")),
     ("factor: is a Polytope. P.cartesian_product", lambda: BOX * BOX.to_polytope()),
     ("rho: 'exact'. Give a number: jm.explicit", lambda: jm.soften(M, "exact")),
+    (
+        "constrain_initial: is False, and constrained_",
+        lambda: mpc(constrain_initial=False, constrained_stages=(0, 2)).validate(),
+    ),
     ("c: 0.01 where (2,) is needed. Give one", lambda: jm.LinearSystem(A, B, 0.01)),
     (
         "K: LQR(K=[[",

@@ -132,3 +132,9 @@ def test_the_cure_for_numbers_in_an_array_of_objects():
     with pytest.raises(ValueError, match=r"np.asarray\(..., dtype=float\)"):
         jm.map_feasible_set(problem(np.asarray), mixed)
     assert jm.map_feasible_set(problem(np.asarray), np.asarray(mixed, dtype=float)).label.size == 1
+
+
+def test_steps_in_float64_where_jax_has_none_are_silent():
+    """They are in float32 then, as the plan is, and no warning says so."""
+    plan = jm.solve_qp(program(np.asarray), jm.ADMM(20, newton_steps=0, dtype="float64"))
+    assert plan.z.dtype == np.float32

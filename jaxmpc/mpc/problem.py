@@ -499,6 +499,9 @@ class MPC:
     def _validate_stages(self) -> None:
         N = self.horizon
         require_stages("constrained_stages", self.constrained_stages, N)
+        if not self.constrain_initial and 0 in (self.constrained_stages or ()):
+            what = "is False, and constrained_stages has 0"
+            fail("constrain_initial", what, "Leave 0 out, or this argument")
         blocks = self.control_horizon
         if blocks is None:
             return

@@ -263,7 +263,8 @@ def admm_end(
     if warm_start is not None:
         t = nearer(splittings(factor, q)[0], bounds, warm(p, warm_start))
     own = q.dtype
-    dtype = jnp.dtype(solver.dtype or ("float32" if refined else own))
+    # Of JAX's arrays: without its float64 there is float32 alone.
+    dtype = jax.dtypes.canonicalize_dtype(solver.dtype or ("float32" if refined else own))
     steps = admm_steps(solver, warm_start)
     product = ROUGH if refined else EXACT
     constants, data = cast(((factor, jnp.asarray(solver.alpha)), (q, bounds, t)), dtype)
