@@ -996,9 +996,9 @@ def test_a_plant_that_is_not_written_in_jax_is_told_what_helps(plant):
 
 @pytest.mark.parametrize("plant", [lambda t, x, u: x, lambda u, x: A @ x + B @ u])
 def test_a_plant_of_other_arguments_is_told_its_own(plant):
-    with pytest.raises(ValueError, match="plant: cannot be called .* is a function of a state"):
+    with pytest.raises(ValueError, match="plant: raises a TypeError .* is a function of a state"):
         jm.simulate(LAW, plant, x, 3)
-    with pytest.raises(ValueError, match="model or task: cannot be called .* in this order"):
+    with pytest.raises(ValueError, match="model or task: raises a TypeError .* in this order"):
         jm.mpc.solve_nonlinear(jm.mpc.NonlinearMPC(M, plant), x)
 
 

@@ -73,7 +73,7 @@ def worst_disturbance(
     best, top = w, np.full(len(starts), -np.inf)
     for _ in range(rounds):
         value, slope = (np.asarray(v, float) for v in rise(*cast((w, starts))))
-        better = ~(value <= top)
+        better = ~(value <= top) & ~np.isnan(top)
         if not better.any():
             break
         best, top = np.where(better[:, None, None], w, best), np.maximum(top, value)

@@ -60,8 +60,9 @@ static void project(const real *t, const real *l, const real *u, const real *pen
 #if NAME_SOFT
     real distance = FABS(v - p);
     if (distance > soft_linear[i] / penalty[i]) { /* p is outside too: from v, which may be far */
-      real paid = soft_linear[i] + soft_quadratic[i] * distance;
-      p = v + (v > p ? -paid : paid) / (penalty[i] + soft_quadratic[i]);
+      real whole = penalty[i] + soft_quadratic[i];
+      real paid = soft_linear[i] / whole + soft_quadratic[i] / whole * distance;
+      p = v + (v > p ? -paid : paid);
     }
 #else
     (void)penalty;

@@ -145,7 +145,8 @@ def roll_out(p: ExactData, x: Array, inputs: Array, moved: Array) -> tuple[Array
     def holds(H, lower, upper, solved, x, error):
         value = H @ x
         size = jnp.abs(H) @ error * (1 + 1e-9) + 2 * row_gamma(H) * (jnp.abs(H) @ jnp.abs(x))
-        slack = jnp.minimum(upper - (value + size), (value - size) - lower)
+        # Added to the value, a small size could be lost, and with it a violation.
+        slack = jnp.minimum(upper - value, value - lower) - size
         return jnp.min(jnp.where(solved, jnp.inf, slack), initial=jnp.inf), value - upper, size
 
     def advance(carry, step):
@@ -175,7 +176,7 @@ def roll_out(p: ExactData, x: Array, inputs: Array, moved: Array) -> tuple[Array
         scale = jnp.abs(p.P)
         rounding = (2 * jnp.abs(x) + error) @ (scale @ error) * (1 + 1e-9)
         rounding = rounding + 2 * gamma(2 * n + 2) * (jnp.abs(x) @ (scale @ jnp.abs(x)))
-        slack = jnp.minimum(slack, p.level - (x @ (p.P @ x) + rounding))
+        slack = jnp.minimum(slack, (p.level - x @ (p.P @ x)) - rounding)
     finite = jnp.all(jnp.isfinite(x)) & jnp.all(jnp.isfinite(inputs))
     slack = jnp.where(finite, slack, -jnp.inf)
     if e is None:

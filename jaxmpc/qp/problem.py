@@ -96,8 +96,10 @@ class Bounds:
         if self.linear is not None:
             # v less how far prox(v) stays outside; that difference is lost where v is far.
             beyond = self._stays_outside(s, rho)
-            weight = jnp.where(beyond, self.linear, 0.0) + self.quadratic * jnp.abs(s)
-            s = jnp.where(beyond, sign(s) * weight / (rho + self.quadratic), s)
+            whole = rho + self.quadratic
+            paid = jnp.where(beyond, self.linear, 0.0) / whole
+            paid = paid + self.quadratic / whole * jnp.abs(s)
+            s = jnp.where(beyond, sign(s) * paid, s)
         for rows, radius in self.blocks():
             s = s.at[rows].multiply(1 - self._shrinking(s[rows], radius))
         return s

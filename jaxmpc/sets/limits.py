@@ -220,20 +220,33 @@ def rows_kept(limits: Limits, x: Values, dtype: DTypeLike | None = None) -> Valu
     not finite.
 
     The tolerance is in parts of the bound; of a bound that is smaller than the other one of its
-    row, in parts of that or in the unit of the row, whichever is less.
+    row, in parts of that or in the unit of the row, whichever is less. A bound below 1e-12 counts
+    as zero, and rounding of the row is allowed for.
 
     dtype: the precision in which x was computed, if other than that of x.
     """
     xp, value, lower, upper = _row_values(limits, x)
-    relative = TOLERANCE[str(np.dtype(value.dtype if dtype is None else dtype))]
+    kind = np.dtype(xp.asarray(x).dtype if dtype is None else dtype)
+    if kind.kind != "f":
+        kind = np.dtype(value.dtype)
+    relative, eps = TOLERANCE[str(kind)], float(np.finfo(kind).eps)
     size = lambda end: xp.where(xp.isfinite(end), xp.abs(end), 0.0)
     larger = xp.maximum(size(lower), size(upper))
+    most = xp.where(larger > 1e-12, larger, 1.0)
+    rounding = 4 * eps * _terms(limits, x)
 
     def room(end: Values) -> Values:
-        most = xp.where(larger > 0, larger, 1.0)
-        return relative * xp.minimum(xp.maximum(1.0, size(end)), most)
+        return relative * xp.minimum(xp.maximum(1.0, size(end)), most) + rounding
 
     return (value - upper <= room(upper)) & (lower - value <= room(lower))
+
+
+def _terms(limits: Any, x: Any) -> Any:
+    """Return the sums |H| |x| (..., rows) of the sizes of the terms of each row."""
+    if limits is None or isinstance(limits, Box):
+        return _row_values(limits, abs(x))[1]
+    H, lower, upper = limits.rows() if isinstance(limits, Polytope) else limits
+    return _row_values((abs(H), lower, upper), abs(x))[1]
 
 
 def _row_values(limits: Limits, x: Values) -> tuple[ModuleType, Values, Values, Values]:

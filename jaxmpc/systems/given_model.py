@@ -63,7 +63,7 @@ def written_in_jax(what: str) -> Iterator[None]:
             cure = "Use jax.numpy in place of numpy, and jnp.where or jax.lax.cond in place of if"
             fail(what, f"is not written in JAX ({text})", cure)
         cure = "A model or plant is a function of a state (n,) and inputs (m,), in this order"
-        fail(what, f"cannot be called ({text})", f"{cure}; a task is one of what `view` gives")
+        fail(what, f"raises a TypeError ({text})", f"{cure}; a task is one of what `view` gives")
 
 
 def _same(a: Any, b: Any) -> bool:

@@ -104,10 +104,12 @@ def tune_solver(
     chosen = Settings.of("tune_solver", {"updates": 200, "batch": 32, **settings})
     chosen.validate()
     require_real("x0s", x0s)
-    pair = isinstance(warm_start, tuple) and len(warm_start) == 2
+    pair = isinstance(warm_start, tuple | list) and len(warm_start) == 2
     if not (pair or warm_start is None or isinstance(warm_start, Plan | WarmStart)):
         cure = "Give a pair (z, y) of arrays, or plans, of all states"
         fail("warm_start", f"{shown(warm_start)} is none of them", cure)
+    for part in warm_start if isinstance(warm_start, tuple | list) else ():
+        require_real("warm_start", part)
     solver = SOLVER if solver is None else solver
     references = reference, input_reference
     objective = _objective(mpc, iterations, stages, groups, solver, references)

@@ -48,7 +48,10 @@ def test_starts_may_be_lists_and_a_loop_that_overflows_has_no_distance():
     same, as_array = worst_disturbance(law, np.array([0.5, 0.0]), 4, seed=1)
     np.testing.assert_array_equal(found, same)
     assert beyond == as_array < 0
-    assert np.isnan(worst_disturbance(law, [0.5, 0.0], 4, plant=Overflows())[1])
+    sequence, beyond = worst_disturbance(law, [0.5, 0.0], 4, plant=Overflows(), seed=1)
+    first = draw_disturbances(mpc, 4, 1, seed=1)[0]
+    assert np.isnan(beyond)
+    np.testing.assert_array_equal(sequence, first)  # the one that did that, and none after it
 
 
 @pytest.mark.slow

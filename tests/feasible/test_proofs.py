@@ -1,5 +1,6 @@
 """The two provers on their own, fed with what no solver would give."""
 
+import itertools
 from dataclasses import replace
 from fractions import Fraction
 
@@ -111,6 +112,22 @@ class TestProofs:
                 assert exact.keeps_all_rows(mpc, x, u)
             some += np.count_nonzero(np.abs(states[proved]).max(axis=1) == 1)
         assert some > 20
+
+    def test_a_limit_that_is_exceeded_by_less_than_its_rounding(self):
+        """s⁺ = a + d + b is 0.0 in floats where a = −b and d = 1e-22, and then r⁺ = r + s is 1 and
+        1e-22 where r is at its limit of 1: no plan keeps that, and small errors are not lost."""
+        A = np.diag([1.0, 1, 1, 0, 1, 0])
+        A[3, :3] = A[4, 3] = 1.0
+        sides = jm.Box(-np.ones(6), np.ones(6))
+        system = jm.LinearSystem(A, np.eye(6)[:, -1:])
+        mpc = jm.MPC(system, np.eye(6), 1, 3, sides, jm.Box(-1, 1))
+        parts = np.array(list(itertools.permutations((1e-2, 1e-22, -1e-2))))
+        states = np.hstack([parts, np.tile([0.0, 1.0, 0.0], (6, 1))])
+        assert not any(exact.keeps_all_rows(mpc, x, np.zeros((3, 1))) for x in states)
+        with enable_x64(True):
+            prove = jax.vmap(prover(exact_form(mpc, np.ones(6))))
+            proved, _ = prove(states, np.zeros((6, 3, 1)))
+        assert not proved.any()
 
     def test_empty_set_cut(self):
         """0'θ ≤ b < 0 excludes every point, and only then may a normal be zero."""

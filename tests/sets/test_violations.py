@@ -54,6 +54,15 @@ def test_what_is_kept_does_not_depend_on_the_unit(unit):
         np.testing.assert_array_equal(rows_kept(limits, points)[:, 0], kept)
 
 
+def test_rounding_of_a_bound_and_of_a_row_breaks_no_limit():
+    """0.1 + 0.2 − 0.3 is 5.6e-17; 10 − 9.9999 is 1e-4 in float32 to its rounding."""
+    assert rows_kept(jm.Box([0.1 + 0.2 - 0.3], [INF]), np.zeros((1, 1))).all()
+    limits = (np.array([[1.0, -1.0]]), np.array([-INF]), np.array([1e-4]))
+    near = np.array([[10.0, 9.9999]], np.float32)
+    assert float(near[0, 0]) - float(near[0, 1]) > 1e-4 * (1 + TOLERANCE["float32"])
+    assert rows_kept(limits, near).all() and not rows_kept(limits, near + [1e-4, 0]).all()
+
+
 def test_tolerance_of_a_row_with_unequal_bounds():
     limits = jm.Box(np.array([-0.5]), np.array([150.0]))
     at = TOLERANCE["float64"]

@@ -426,7 +426,9 @@ def draw_values(ax: Axes, points: np.ndarray, value: np.ndarray, colours: dict[i
     order = np.lexsort(points.T[::-1])
     x, y = (np.unique(column) for column in points.T)
     is_grid = len(x) * len(y) == len(points) and min(len(x), len(y)) > 1
-    even = is_grid and all(np.allclose(np.diff(v), np.ptp(v) / (len(v) - 1)) for v in (x, y))
+    even = is_grid and all(
+        np.allclose(np.diff(v), np.ptp(v) / (len(v) - 1), atol=0) for v in (x, y)
+    )
     every = np.array(np.meshgrid(x, y, indexing="ij")).reshape(2, -1).T
     if even and np.array_equal(points[order], every):
         value = value[order]
