@@ -8,6 +8,7 @@
 #define _POSIX_C_SOURCE 199309L
 #include <stdio.h>
 #include <stdlib.h>
+#include <string.h>
 #include <time.h>
 
 #include "NAME.h"
@@ -16,7 +17,7 @@ int main(void) {
   static NAME_memory memory;
   static char line[65536];
   double worst = 0, total = 0;
-  long count = 0;
+  long count = 0, lines = 0;
   NAME_reset(&memory);
   while (fgets(line, sizeof line, stdin)) {
     NAME_real x[NAME_STATES], u[NAME_INPUTS];
@@ -24,13 +25,19 @@ int main(void) {
     struct timespec begin, end;
     char *at = line, *next;
     int found = 0;
+    lines++;
     for (; found < NAME_STATES; found++, at = next) {
       x[found] = (NAME_real)strtod(at, &next);
       if (next == at) break;
     }
-    if (found < NAME_STATES) {
+    at += strspn(at, " \t\r\n");
+    if (!found && !*at) {
       NAME_reset(&memory);
       continue;
+    }
+    if (found < NAME_STATES || *at) {
+      fprintf(stderr, "line %ld: give %d numbers with blanks between them\n", lines, NAME_STATES);
+      return 1;
     }
     clock_gettime(CLOCK_MONOTONIC, &begin);
     NAME_step(&memory, x, NULL, NULL, u, &info);

@@ -4,19 +4,31 @@
  *   echo "X0" | ./NAME_example
  */
 #include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
 
 #include "NAME.h"
 
 int main(void) {
-  NAME_real x[NAME_PARAMETERS], u[NAME_INPUTS];
-  for (;;) {
-    for (int i = 0; i < NAME_PARAMETERS; i++) {
-      double value;
-      if (scanf("%lf", &value) != 1) return 0;
-      x[i] = (NAME_real)value;
+  static char line[65536];
+  for (long lines = 1; fgets(line, sizeof line, stdin); lines++) {
+    NAME_real x[NAME_PARAMETERS], u[NAME_INPUTS];
+    char *at = line, *next;
+    int found = 0;
+    for (; found < NAME_PARAMETERS; found++, at = next) {
+      x[found] = (NAME_real)strtod(at, &next);
+      if (next == at) break;
+    }
+    at += strspn(at, " \t\r\n");
+    if (!found && !*at) continue;
+    if (found < NAME_PARAMETERS || *at) {
+      fprintf(stderr, "line %ld: give %d numbers with blanks between them\n", lines,
+              NAME_PARAMETERS);
+      return 1;
     }
     int status = NAME_evaluate(x, u);
     for (int i = 0; i < NAME_INPUTS; i++) printf("%.17g ", (double)u[i]);
     printf("%d\n", status);
   }
+  return 0;
 }

@@ -6,6 +6,7 @@ what its status claims. By hand, 10 million calls a law and type:
     python tests/export/test_c_bad_data.py 10000000
 """
 
+import re
 import shutil
 import subprocess
 import sys
@@ -101,6 +102,22 @@ def test_names_that_hold_words_of_the_templates(name, tmp_path):
     export_c(CASES["all"][0](), tmp_path, jm.ADMM(iterations=4, newton_steps=0), name=name)
     command = [COMPILERS[0], *STRICT, f"{name}.c", f"{name}_example.c", "-lm", "-o", "example"]
     subprocess.run(command, cwd=tmp_path, check=True)
+
+
+@pytest.mark.parametrize("case", ["all", "explicit"])
+def test_the_example_says_which_line_it_cannot_read(case, tmp_path):
+    exported(case, tmp_path, "float64")
+    command = [COMPILERS[0], *STRICT, "law.c", "law_example.c", "-lm", "-o", "example"]
+    subprocess.run(command, cwd=tmp_path, check=True)
+    states = "0.1 0.05"
+    for text, answers in ((states, 1), (f"{states}\n\n {states} \r", 2), (f"{states}\n0.3,0", 1),
+                          ("0.3", 0), (f"{states} 7", 0), (f"{states}x", 0)):  # fmt: skip
+        done = subprocess.run(
+            [tmp_path / "example"], input=f"{text}\n", capture_output=True, text=True, check=False
+        )
+        good = answers > 1 or text == states
+        assert len(done.stdout.splitlines()) == answers and done.returncode == (not good)
+        assert good or re.match(r"line [12]: give 2 numbers with blanks", done.stderr)
 
 
 def test_names_of_headers_are_refused(tmp_path):
