@@ -17,13 +17,12 @@ import scipy
 from jaxmpc.checks import fail
 from jaxmpc.mpc.condense import Inequalities, row_lengths
 from jaxmpc.pytrees import record
-from jaxmpc.sets import lp
 from jaxmpc.sets.convex_sets import Polytope
 from jaxmpc.sets.geometry import Empty, Flat, affine_hull, framed
-from jaxmpc.sets.lp import Program, bound, extent, maximise, power_of_two
+from jaxmpc.sets.lp import FLAT, Program, bound, extent, maximise, power_of_two
 
 # Reasons why a set has no facets: it has no volume.
-EMPTY, FLAT = "the feasible set is empty", "the feasible set is flat: it has no volume"
+IS_EMPTY, IS_FLAT = "the feasible set is empty", "the feasible set is flat: it has no volume"
 # Bounds of linear programs are trusted to this, relative to the size of the set.
 TOLERANCE = 1e-9
 # Facets are enumerated up to this dimension, and this many of them.
@@ -132,7 +131,7 @@ class PlanPolytope:
         t = np.concatenate([c.phi[1], c.psi[0]])
         return cls(np.hstack([rows.D, rows.C]), rows.b, M[:p], t[:p], not c.balls).reduced()
 
-    def reduced(self, tolerance: float = lp.FLAT) -> "PlanPolytope":
+    def reduced(self, tolerance: float = FLAT) -> "PlanPolytope":
         """Return the polytope in coordinates (θ, w) in which it has volume, v = shift + basis (θ,
         w). Rows that leave less room than `tolerance` are equalities."""
         if self.program.empty:
@@ -233,14 +232,14 @@ def projected(plans: PlanPolytope, deadline: float = np.inf) -> CenteredPolytope
     if plans.p > DIMENSIONS:
         return f"vertices are not enumerated in {plans.p} dimensions (up to {DIMENSIONS} they are)"
     if plans.flat:
-        return FLAT
+        return IS_FLAT
     try:
         center = plans.center()
     except Empty:
-        return EMPTY
+        return IS_EMPTY
     except Flat:
-        thinner = plans.reduced(10 * lp.FLAT)
-        return FLAT if thinner is plans else projected(thinner, deadline)
+        thinner = plans.reduced(10 * FLAT)
+        return IS_FLAT if thinner is plans else projected(thinner, deadline)
     except ValueError as error:
         return f"its facets are too ill-conditioned ({error})"
     extent = plans.extent

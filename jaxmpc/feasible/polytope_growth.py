@@ -11,9 +11,9 @@ from jaxmpc.checks import entries, fail, require_kind, whole
 from jaxmpc.feasible.hard_constraints import augmented_dynamics
 from jaxmpc.feasible.plan_polytope import (
     DIMENSIONS,
-    EMPTY,
     FACETS,
-    FLAT,
+    IS_EMPTY,
+    IS_FLAT,
     CenteredPolytope,
     projected,
 )
@@ -59,7 +59,7 @@ def _polytope(mpc: MPC, body: CenteredPolytope | str) -> Polytope:
     if not isinstance(body, str):
         return body.polytope
     cure = "Map it with map_feasible_set, which has no such limit"
-    if body in (EMPTY, FLAT) and mpc.disturbance is not None and mpc.policy != "tightened":
+    if body in (IS_EMPTY, IS_FLAT) and mpc.disturbance is not None and mpc.policy != "tightened":
         body, cure = f"its feasible set {NO_VOLUME}", MORE_ROOM
     elif "empty" in body:
         cure = RELAX
@@ -185,7 +185,7 @@ def feasible_growth(mpc: MPC, horizons: Sequence[int]) -> Growth:
     sets = []
     for changed in (replace(mpc, horizon=N) for N in every):
         found = _all_facets(changed)
-        nothing = isinstance(found, str) and found in (EMPTY, FLAT)
+        nothing = isinstance(found, str) and found in (IS_EMPTY, IS_FLAT)
         sets.append(None if nothing else _polytope(changed, found))
     return Growth(
         horizons=np.array(every, int),

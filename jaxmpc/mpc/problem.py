@@ -41,7 +41,7 @@ T = TypeVar("T")
 StagesOf = Callable[[], tuple[int, ...]]
 
 # Curvature of the cost, relative to its terms, below which a direction of the inputs costs nothing.
-FLAT = 1e-12
+CURVATURE = 1e-12
 # What helps where no state has a plan; without a terminal set no longer horizon: X_{N+1} ⊆ X_N.
 RELAX = "Relax a limit; with a terminal set enlarge that or lengthen the horizon"
 # What decides whether a state has a plan and may differ from step to step.
@@ -653,7 +653,7 @@ class MPC:
             terms = np.diag(abs(effort) + abs(W) + _form(move, size))
             unit = 1 / np.sqrt(np.where(terms > 0, terms, 1.0))
             values, axes = np.linalg.eigh(unit[:, None] * G * unit)
-            curved = values > FLAT
+            curved = values > CURVATURE
             if not (curved.all() or 0 < first <= moves[k]):
                 self._refuse_flat(k, unit[:, None] * axes[:, ~curved])
             Y = move.T @ S @ free - np.hstack([np.zeros((m, n)), W])

@@ -27,7 +27,7 @@ from jaxmpc.systems.system import LinearSystem, host_matrices
 from jaxmpc.systems.units import balanced, less_identity
 
 # Singular values of balanced matrices, relative to the largest, that count as zero.
-FLAT = 1e-10
+SINGULAR = 1e-10
 # Weight of effort beside distances of outputs, where these leave inputs free, in units in which the
 # row that outputs move most beside effort sees both alike (`_price`). Outputs are off by its square
 # (`SteadyStates.nearest`). Rows of less than LEAST_SHARE of that do not count for it.
@@ -181,7 +181,7 @@ class SteadyStates:
         M = np.hstack([-less_identity(A), -B])
         row, column = balanced(M)
         left, values, right = np.linalg.svd(row[:, None] * M * column)
-        if values[-1] <= FLAT * values[0]:
+        if values[-1] <= SINGULAR * values[0]:
             names = system.state_names or tuple(f"x{i + 1}" for i in range(n))
             entry = np.abs(left[:, -1])
             which = [name for name, v in zip(names, entry, strict=True) if v > 0.1 * entry.max()]
@@ -265,7 +265,7 @@ def _price(H: Array, free: Array, count: int) -> Array:
     """
     m = free.shape[1]
     moved, size = matmul(H, free), matmul(jnp.abs(H), jnp.abs(free))
-    moved = jnp.where(jnp.abs(moved) > FLAT * size, moved, 0.0)
+    moved = jnp.where(jnp.abs(moved) > SINGULAR * size, moved, 0.0)
     along, across = (jnp.linalg.norm(part, axis=1) for part in (moved[:, :count], moved[:, count:]))
     both = (along > 0) & (across > 0)
     share = jnp.where(both, across / jnp.where(both, along, 1.0), jnp.nan)
