@@ -23,7 +23,7 @@ from jaxmpc.closed_loop.simulation import Run
 from jaxmpc.pytrees import record
 from jaxmpc.qp.linalg import matmul
 from jaxmpc.sets.convex_sets import Box, Polytope
-from jaxmpc.sets.limits import row_violations
+from jaxmpc.sets.limits import row_violations, rows_kept
 
 # Names of the terms, in the order in which they are told.
 TERMS = ("tracking", "effort", "violation", "settling")
@@ -136,9 +136,11 @@ class ClosedLoopLoss:
         units = limits.half_widths() if isinstance(limits, Box) else 1.0
         return row_violations(limits, x) / units
 
-    def worst(self, run: Run) -> Array:
-        """Return the largest violation of a run."""
-        return jnp.max(self.excess(self._coordinates(run)))
+    def kept(self, run: Run) -> Array:
+        """Return whether a run keeps the limits."""
+        x = self._coordinates(run)
+        limits = jax.tree.map(lambda v: jnp.asarray(v, x.dtype), self.limits)
+        return jnp.all(rows_kept(limits, x))
 
     def _coordinates(self, run: Run) -> Array:
         """Return the states in the coordinates of the problem, (T+1, n)."""

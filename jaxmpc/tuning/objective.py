@@ -28,7 +28,7 @@ from jaxmpc.pytrees import record
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.linalg import arrays
 from jaxmpc.qp.status import Status
-from jaxmpc.sets.limits import TOLERANCE
+from jaxmpc.sets.limits import rows_kept
 from jaxmpc.tuning.batch_mean import BatchMean
 from jaxmpc.tuning.losses import TERM, ClosedLoopLoss, SeveralLosses
 from jaxmpc.tuning.parameters import Parameters, values
@@ -85,8 +85,9 @@ class ClosedLoopObjective:
         x0s: Array,
         varied: dict[str, Array],
         checkpoint: bool = False,
-    ) -> tuple[Run, Array]:
-        """Return the loops (B, …), and the design loss."""
+    ) -> tuple[Run, Array, Array]:
+        """Return the loops (B, …), whether each breaks a limit of the states, (B,), and the design
+        loss."""
         given = values(self.parameters, theta)
         controller = self.build(given)
         shared = {"reference": self.reference, "input_reference": self.input_reference}
@@ -103,7 +104,13 @@ class ClosedLoopObjective:
         design = jnp.zeros(())
         if self.design_loss is not None:
             design = jnp.asarray(self.design_loss(controller.mpc))
-        return run, design
+        if isinstance(self.loss, ClosedLoopLoss) and self.loss.limits is not None:
+            broken = ~jax.vmap(self.loss.kept)(run)
+        else:
+            x = jax.vmap(jax.vmap(controller.coordinates))(run.states)
+            limits = jax.tree.map(lambda v: jnp.asarray(v, x.dtype), controller.limits)
+            broken = ~jnp.all(rows_kept(limits, x), axis=(1, 2))
+        return run, broken, design
 
     def losses(self, run: Run, varied: dict[str, Array]) -> tuple[Array, dict[str, Array]]:
         """Return the loss of each of the loops (B, …), and of several losses each."""
@@ -123,15 +130,12 @@ class ClosedLoopObjective:
         checkpoint: bool = False,
     ) -> tuple[Array, dict[str, Array]]:
         """Return the weighted mean loss, and the recorded numbers of each loop."""
-        run, design = self.loops(theta, plant, x0s, varied, checkpoint)
+        run, broken, design = self.loops(theta, plant, x0s, varied, checkpoint)
         losses, terms = self.losses(run, varied)
-        return mean(losses, weights) + design, self.numbers(run, losses, design) | terms
+        return mean(losses, weights) + design, self.numbers(run, broken, losses, design) | terms
 
-    def numbers(self, run: Run, losses: Array, design: Array) -> dict[str, Array]:
+    def numbers(self, run: Run, broken: Array, losses: Array, design: Array) -> dict[str, Array]:
         """Return the recorded numbers of each loop, and the design loss."""
-        worst = jnp.max(run.violation, axis=1)
-        if isinstance(self.loss, ClosedLoopLoss) and self.loss.limits is not None:
-            worst = jax.vmap(self.loss.worst)(run)
         fraction = lambda v: jnp.mean(v.astype(float), axis=1)
         return {
             "losses": losses,
@@ -139,7 +143,7 @@ class ClosedLoopObjective:
             "unsolved": fraction(run.status != Status.SOLVED),
             "infeasible": fraction(run.status == Status.PRIMAL_INFEASIBLE),
             "fallback": fraction(run.fallback & (run.status == Status.SOLVED)),
-            "violation": worst > TOLERANCE[run.states.dtype.name],
+            "violation": broken,
         }
 
     def check(self, theta: Any, data: Data) -> None:
@@ -282,10 +286,10 @@ class ClosedLoopObjective:
             flat, (*_, varied, weights) = ravel_pytree(theta)[0], rest
 
             def at(flat: Array) -> tuple[Any, Any]:
-                run, design = self.loops(unravel(flat), *rest[:-1])
+                run, broken, design = self.loops(unravel(flat), *rest[:-1])
                 losses, terms = self.losses(run, varied)
                 total = mean(losses, weights) + design
-                numbers = self.numbers(run, losses, design) | terms
+                numbers = self.numbers(run, broken, losses, design) | terms
                 return (total, run.states, run.inputs), (run, numbers)
 
             one = lambda v: jax.jvp(at, (flat,), (v,), has_aux=True)

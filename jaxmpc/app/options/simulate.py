@@ -50,7 +50,7 @@ class SimulateOptions:
                      --tolerance of half its range (limits' half-width; 1 where it has none, and
                      any velocity where velocities have none)
       limits kept    robots with all states and inputs within the limits at all time steps, to 1e-6
-                     (1e-6 of the limit, where that is above 1). The margin is not counted in.
+                     of the limit. The margin is not counted in.
       plans valid    robots all of whose plans were solved without fallback; how many kept limits
       worst          the largest violation relative to half the range, in its own unit
       plans solved   plans whose residuals pass: 1e-6; along trajectories in float32 1e-3

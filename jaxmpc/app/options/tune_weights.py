@@ -62,8 +62,8 @@ class TuneWeightsOptions:
     How to read the table
       loss        mean over the validation loops, before and after, and the change; below it its
                   terms, in the new simulations: tracking, effort, violation, time to settle
-      violated    validation loops that violate a limit of states or inputs by more than 1e-6 (of
-                  the limit, where that is above 1), not counting the tightening
+      violated    validation loops that violate a limit of states or inputs by more than 1e-6 of
+                  the limit, not counting the tightening
       unsolved    plans whose residuals exceed 1e-6 (along trajectories in float32 1e-3)
       infeasible  those of them that are proved infeasible
       unproved    the others of them: inaccurate, stopped too early, or data not finite

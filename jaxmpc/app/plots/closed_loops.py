@@ -51,7 +51,7 @@ def plot_runs(
     run: of `simulate` or `simulate_many`, of a Robot or LinearPlant. Limits are lines, what lies
     outside is grey. Orange: the plan was solved and needs slack, hence exceeds soft limits
     somewhere on its horizon (fallback). Purple: the plan was not solved. Red: limits exceeded by
-    more than 1e-6 (of the limit, if that is above 1). Cross: the next value is not finite.
+    more than 1e-6 of the limit. Cross: the next value is not finite.
     reference (n,), input_reference (m,): set-points to draw, or over time as `simulate` takes them.
     robots: which of the batch to draw, 24 at most by default. title: None: counts of loops and
     plans, of all of the batch. The figure has another size by its `set_size_inches`. Raises
