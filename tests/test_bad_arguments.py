@@ -867,6 +867,20 @@ def test_numbers_and_vectors_stand_for_the_matrices_they_mean():
         mpc(Q=1.0).validate()
 
 
+@pytest.mark.parametrize("rows", [jm.Outputs, jm.Soft])
+def test_one_row_may_be_a_vector_and_its_sides_numbers(rows):
+    found, same = rows([1, 0], -1, 2, D=[0.5]), rows([[1, 0]], [-1], [2], D=[[0.5]])
+    for name in ("C", "lower", "upper", "D"):
+        value, expected = getattr(found, name), getattr(same, name)
+        assert value.dtype == expected.dtype
+        np.testing.assert_array_equal(value, expected)
+    of_all = rows(np.eye(2), upper=3)
+    assert of_all.lower is None
+    np.testing.assert_array_equal(of_all.upper, [3, 3])
+    slope = jax.grad(lambda end: jnp.sum(rows(np.eye(2), upper=end).upper))(3.0)
+    assert slope == 2
+
+
 def test_two_numbers_are_an_interval():
     box = jm.Box(-1, 3)
     box.validate("box", 1)

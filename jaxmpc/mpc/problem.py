@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from functools import reduce
 from typing import Any, NamedTuple, TypeVar
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -72,10 +73,28 @@ def at_stage(part: T, j: int) -> T:
 
 
 class TwoSided:
-    """Rows with the sides lower and upper, either of them None."""
+    """Rows C, D with the sides lower and upper, either of them None."""
 
+    C: Any
+    D: Any
     lower: Any
     upper: Any
+
+    def _fill(self) -> None:
+        """Make one row of vectors C and D, and of numbers the sides of every row."""
+        if dimensions(self.C) == 1:
+            object.__setattr__(self, "C", as_column(self.C).T)
+        if (dimensions(self.C) or 0) < 2:
+            return  # `validate` says what is wrong, and `in_axes` are rows without arrays
+        rows = np.shape(as_array(self.C))[-2]
+        if dimensions(self.D) == 1 and rows == 1:
+            object.__setattr__(self, "D", as_column(self.D).T)
+        for name in ("lower", "upper"):
+            side = getattr(self, name)
+            if dimensions(side) == 0:
+                full = jnp.full if isinstance(side, jax.Array) else np.full
+                object.__setattr__(self, name, full((rows,), side))
+                store_floats(self, name)
 
     @property
     def sides(self) -> tuple[Any, Any]:
@@ -90,9 +109,9 @@ class Outputs(TwoSided):
     """Hard limits of outputs, lower ≤ C x_k + D u_k ≤ upper.
 
     Arguments:
-        C: (p, n), one row an output.
-        lower, upper: (p,), in the units of the outputs; None where all rows lack that side, −inf
-            and inf where single rows do.
+        C: (p, n), one row an output; a vector is one row.
+        lower, upper: (p,), in the units of the outputs, or a number for all; None where all rows
+            lack that side, −inf and inf where single rows do.
         D: (p, m), or None for zero.
         stages: the k at which they hold; None: those of the state limits, and where the state
             limits hold at k = N, without D there too.
@@ -111,6 +130,7 @@ class Outputs(TwoSided):
 
     def __post_init__(self) -> None:
         store_floats(self, "C", "lower", "upper", "D")
+        self._fill()
         store_stages(self, "stages")
 
 
@@ -144,6 +164,7 @@ class Soft(TwoSided):
 
     def __post_init__(self) -> None:
         store_floats(self, "C", "lower", "upper", "rho", "quadratic", "D")
+        self._fill()
         store_stages(self, "stages")
 
 

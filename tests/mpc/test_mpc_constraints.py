@@ -1072,7 +1072,7 @@ WRONG = {
         r"soft\[1\].upper",
         "bound",
     ),
-    "C a vector": (soft(C=ONE), r"soft\[0\].C", "one column a state"),
+    "C a vector": (soft(C=ONE), r"soft\[0\].upper", "each row of C"),
     "C of three states": (soft(C=np.eye(3)), r"soft\[0\].C", r"\(p, 2\)"),
     "C of no rows": (soft(C=np.zeros((0, 2)), upper=np.zeros(0)), r"soft\[0\].C", "Give"),
     "C with NaN": (soft(C=EYE * np.nan), r"soft\[0\].C", "finite"),
