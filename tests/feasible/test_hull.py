@@ -189,3 +189,14 @@ def test_tiny_terminal_sets_leave_volume(size):
         inputs=jm.Box(-1, 1), terminal_set=jm.Box(-size, size),
     )  # fmt: skip
     assert jm.feasible_polytope(mpc).volume() == pytest.approx(area, rel=1e-7)
+
+
+@pytest.mark.parametrize("far", [1e3, 1e10, 1e12, 1e15])
+def test_facets_stay_valid_beside_a_limit_that_means_none(far):
+    """0 ≤ x₁ ≤ far: whatever details of size 1 the set loses, it holds each state with a plan."""
+    system = jm.LinearSystem([[1, 1], [0, 1.0]], [[0.5], [1]])
+    mpc = jm.MPC(system, [1.0, 1.0], 0.1, 4, states=jm.Box([0, -3], [far, 3]), inputs=jm.Box(-1, 1))
+    near = jm.grid([0.05, -2.95], [4.95, 2.95], 15)
+    with_plan = near[jm.map_feasible_set(mpc, near).label == 1]
+    assert 150 < len(with_plan) < 225
+    assert np.all(jm.feasible_polytope(mpc).contains(with_plan))
