@@ -1,6 +1,7 @@
 """The picture shows what the map holds, in any figure, without a window."""
 
 import dataclasses
+import tracemalloc
 from types import SimpleNamespace
 
 import matplotlib.pyplot as plt
@@ -114,6 +115,19 @@ def test_cells_have_the_labels_of_their_states(order):
     i = ((points[:, 0] - left) / (right - left) * cells.shape[1]).astype(int)
     j = ((points[:, 1] - low) / (high - low) * cells.shape[0]).astype(int)
     np.testing.assert_array_equal(cells[j, i], fmap.label)
+
+
+def test_scattered_states_take_no_memory_of_a_grid():
+    """Of 6,000 there are 36 million pairs of coordinates; two of a grid at one place are none."""
+    points = np.random.default_rng(0).uniform(-2, 2, (6000, 2))
+    tracemalloc.start()
+    assert not plot_feasible_set(Map(points)).images
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most < 1e8
+    twice = square(5)
+    twice[7] = twice[6]
+    assert not plot_feasible_set(Map(twice)).images
 
 
 def test_cells_end_at_the_bounds(tmp_path):

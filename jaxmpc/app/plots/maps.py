@@ -423,15 +423,13 @@ def draw_values(ax: Axes, points: np.ndarray, value: np.ndarray, colours: dict[i
 
     The last of `colours` lies on top.
     """
-    order = np.lexsort(points.T[::-1])
     x, y = (np.unique(column) for column in points.T)
     is_grid = len(x) * len(y) == len(points) and min(len(x), len(y)) > 1
-    even = is_grid and all(
-        np.allclose(np.diff(v), np.ptp(v) / (len(v) - 1), atol=0) for v in (x, y)
-    )
-    every = np.array(np.meshgrid(x, y, indexing="ij")).reshape(2, -1).T
-    if even and np.array_equal(points[order], every):
-        value = value[order]
+    # Different points, as many as there are pairs (x, y), are all of these.
+    is_grid = is_grid and len(np.unique(points, axis=0)) == len(points)
+    even = lambda v: np.allclose(np.diff(v), np.ptp(v) / (len(v) - 1), atol=0)
+    if is_grid and even(x) and even(y):
+        value = value[np.lexsort(points.T[::-1])]
         half = np.array([x[-1] - x[0], y[-1] - y[0]]) / (2 * np.array([len(x) - 1, len(y) - 1]))
         extent = (x[0] - half[0], x[-1] + half[0], y[0] - half[1], y[-1] + half[1])
         ax.imshow(
