@@ -115,6 +115,14 @@ def as_weight(value: Any, size: int, steps: int | None = None) -> Any:
     return value
 
 
+def fill(instance: Any, name: str, shape: tuple[int, ...]) -> None:
+    """Make an array of floats of this shape of a number in a field of a frozen dataclass."""
+    value = getattr(instance, name)
+    full = jnp.broadcast_to if isinstance(value, jax.Array) else np.broadcast_to
+    object.__setattr__(instance, name, full(value, shape))
+    store_floats(instance, name)
+
+
 def as_column(value: Reals) -> jax.Array | np.ndarray:
     """Return a vector (n,) as a matrix (n, 1)."""
     return _array(value)[:, None]

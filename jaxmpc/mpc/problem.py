@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from functools import reduce
 from typing import Any, NamedTuple, TypeVar
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -16,6 +15,7 @@ from jaxmpc.arrays import (
     as_column,
     as_weight,
     dimensions,
+    fill,
     host_array,
     store_floats,
 )
@@ -90,11 +90,8 @@ class TwoSided:
         if dimensions(self.D) == 1 and rows == 1:
             object.__setattr__(self, "D", as_column(self.D).T)
         for name in ("lower", "upper"):
-            side = getattr(self, name)
-            if dimensions(side) == 0:
-                full = jnp.full if isinstance(side, jax.Array) else np.full
-                object.__setattr__(self, name, full((rows,), side))
-                store_floats(self, name)
+            if dimensions(getattr(self, name)) == 0:
+                fill(self, name, (rows,))
 
     @property
     def sides(self) -> tuple[Any, Any]:

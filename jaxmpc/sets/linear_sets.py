@@ -16,11 +16,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy
 
-from jaxmpc.arrays import Reals, as_array, dimensions, host_array, store_floats
+from jaxmpc.arrays import Reals, as_array, dimensions, fill, host_array, store_floats
 from jaxmpc.checks import (
     concrete,
     fail,
@@ -617,14 +616,8 @@ class Box(LinearSet):
         axes = dimensions(self.lower), dimensions(self.upper)
         if axes in ((0, 1), (1, 0), (0, 2), (2, 0)):
             one, other = ("lower", "upper") if axes[0] == 0 else ("upper", "lower")
-            self._fill(one, np.shape(as_array(getattr(self, other)))[-1:])
+            fill(self, one, np.shape(as_array(getattr(self, other)))[-1:])
         self._require_given(lower=1, upper=1)
-
-    def _fill(self, name: str, shape: tuple[int, ...]) -> None:
-        value = getattr(self, name)
-        full = jnp.broadcast_to if isinstance(value, jax.Array) else np.broadcast_to
-        object.__setattr__(self, name, full(value, shape))
-        store_floats(self, name)
 
     def spread(self, n: int) -> "Box":
         """Return the box with two numbers as the bounds of each of n coordinates; any other box
@@ -633,7 +626,7 @@ class Box(LinearSet):
             return self
         box = Box(self.lower, self.upper)
         for name in ("lower", "upper"):
-            box._fill(name, (n,))
+            fill(box, name, (n,))
         return box
 
     @property

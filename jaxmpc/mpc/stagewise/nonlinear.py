@@ -211,10 +211,8 @@ class NonlinearMPC:
             fail("tasks", f"is a {type(self.tasks).__name__}", "Give a tuple of jm.mpc.Task")
         for task in self.tasks:
             if not callable(task.function):
-                what = f"is a {type(task.function).__name__}"
-                fail(
-                    f"{task.name}.function", what, "Give a function of what the model's view gives"
-                )
+                cure = "Give a function of what the model's view gives"
+                fail(f"{task.name}.function", f"is a {type(task.function).__name__}", cure)
         after, values, _ = self._shapes()
         if after != (self.mpc.system.n,):
             cure = f"Give the next state ({self.mpc.system.n},), as mpc.system has it"
