@@ -48,6 +48,7 @@ from jaxmpc.qp.kernel import in_one_program
 from jaxmpc.qp.linalg import infinity_norm, matmul, solve
 from jaxmpc.qp.problem import FREE, Bounds
 from jaxmpc.qp.residuals import (
+    Correcting,
     Pair,
     Proof,
     correcting_rows,
@@ -378,8 +379,7 @@ def improve(
     correcting = correcting_rows(qp)
     if has_dual_steps(qp.balls, qp.A) and not fixed:
         # The dual of an infeasible program has no maximum: steps towards it would be wasted.
-        allowed = p.eps * row_sizes(0.0, qp.row_sizes, p.typical_sizes(begin.w, begin.y))
-        _, _, empty = farkas(qp, f.E * begin.change, correcting, allowed)
+        empty = proved_empty(p, correcting, begin)
         best, y = solve_dual(p, begin.y, ~f.flat & ~empty, most)
         go_on = ~best.finished
         # Multipliers that grow without bound are nearly a Farkas vector.
@@ -416,6 +416,26 @@ def improve(
         if has_dual_steps(qp.balls, qp.A):
             s = replace(s, best=corrected_end(p, s))
     return s.best, s.proof, ~false, s.idle > max(most // 2, LEAST_IDLE)
+
+
+def proved_empty(p: ScaledProgram, correcting: Correcting, begin: MultiplierState) -> Array:
+    """Return whether the last change of ADMM's multipliers is a Farkas vector.
+
+    Beside kernels it is asked of those changes alone whose support is negative before it is
+    corrected: nine in ten of those that are one, and 1 % of the others at most (joint, springs of
+    4 and 8 states). Elsewhere one more loop costs more to compile than it saves."""
+
+    def ask(given: tuple, _: tuple[Array, Array]) -> tuple[Array, Array]:
+        p, correcting, begin = given
+        allowed = p.eps * row_sizes(0.0, p.qp.row_sizes, p.typical_sizes(begin.w, begin.y))
+        empty = farkas(p.qp, p.factor.E * begin.change, correcting, allowed)[2]
+        return jnp.asarray(False), empty
+
+    given, false = (p, correcting, begin), jnp.asarray(False)
+    if not has_kernels(len(begin.y)):
+        return ask(given, (false, false))[1]
+    support = jnp.sum(p.bounds.support(p.bounds.admissible(begin.change)))
+    return repeat_while(lambda s: s[0], ask, given, (support < 0, false), steps="long")[1]
 
 
 def corrected_end(p: ScaledProgram, s: Refinement) -> Pair:
