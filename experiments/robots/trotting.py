@@ -1,12 +1,14 @@
 """Quadrupeds that trot, and are pushed at the trunk on the way.
 
-    python experiments/robots/trotting.py [--count 16] [--seconds 4] [--push 10] [--film FILE]
+    python experiments/robots/trotting.py [--count 16] [--seconds 4] [--push 10] [--turn 0]
+        [--film FILE]
 
-Each begins at rest and follows `jm.robots.gait` at `--speed` along x: two feet stand while the
-other two swing. The first robot is left alone; each other one is pushed for 0.1 s after half the
-time, in a horizontal direction of its own, by an impulse between nothing and `--push` N s. A robot
-trots if its trunk stays above 0.15 m and within 45°. Compared with MuJoCo's C engine: each step of
-the plant, and the first robot's whole run with the C engine in the place of the plant.
+Each begins at rest and follows `jm.robots.gait` at `--speed` ahead, turning at the rate `--turn`
+(rad/s): two feet stand while the other two swing. The first robot is left alone; each other one is
+pushed for 0.1 s after half the time, in a horizontal direction of its own, by an impulse between
+nothing and `--push` N s. A robot trots if its trunk stays above 0.15 m and within 45°. Compared
+with MuJoCo's C engine: each step of the plant, and the first robot's whole run with the C engine in
+the place of the plant.
 """
 
 import argparse
@@ -43,18 +45,28 @@ def on_c_engine(controller: GaitController, x: np.ndarray, steps: int) -> np.nda
     return np.array(states)
 
 
+def motion(states: np.ndarray, first: int, dt: float) -> str:
+    """Return how fast the trunk moves and turns from a time step on."""
+    part = states[first:]
+    seconds = (len(part) - 1) * dt
+    way = np.linalg.norm(np.diff(part[:, :2], axis=0), axis=1).sum()
+    heading = np.unwrap(2 * np.arctan2(part[:, 6], part[:, 3]))
+    return f"{way / seconds:.4f} m/s and {(heading[-1] - heading[0]) / seconds:.4f} rad/s"
+
+
 def main() -> None:
     """Print how the robots trot."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--count", type=int, default=16)
     parser.add_argument("--seconds", type=float, default=4.0)
     parser.add_argument("--speed", type=float, default=0.5)
+    parser.add_argument("--turn", type=float, default=0.0)
     parser.add_argument("--push", type=float, default=10.0)
     parser.add_argument("--film", type=Path)
     given = parser.parse_args()
     began = time.perf_counter()
     robot = jm.load_robot(FILE, control_period=0.01)
-    gait = jm.robots.gait(robot, FEET, (given.speed, 0.0))
+    gait = jm.robots.gait(robot, FEET, (given.speed, 0.0), turn=given.turn)
     controller = GaitController(gait, Q, R, horizon=30)
     print(f"gait and controller made in {time.perf_counter() - began:.0f} s", flush=True)
     x, _ = gait.robot.equilibrium()
@@ -84,13 +96,11 @@ def main() -> None:
     )
     print(f"{np.mean(run.status[well] == jm.Status.SOLVED):.4%}")
     alone = run.states[0]
-    speed = (alone[-1, 0] - alone[half, 0]) / ((steps - half) * robot.dt)
     tilt = 2 * np.linalg.norm(alone[:, 4:6], axis=1).max()
-    print(
-        f"the one left alone: {speed:.4f} m/s in the second half, trunk {alone[:, 2].min():.4f} to "
-    )
-    print(f"{alone[:, 2].max():.4f} m high, tilted {np.degrees(tilt):.2f}° at most, ", end="")
-    print(f"{np.abs(alone[:, 1]).max() * 1e3:.1f} mm aside")
+    aside = np.linalg.norm(alone[:, :2] - gait.reference(steps + 1)[:, :2], axis=1)
+    print(f"the one left alone: {motion(alone, half, robot.dt)} in the second half, trunk ", end="")
+    print(f"{alone[:, 2].min():.4f} to {alone[:, 2].max():.4f} m high, tilted ", end="")
+    print(f"{np.degrees(tilt):.2f}° at most, {aside.max() * 1e3:.1f} mm from its motion")
     chosen = np.flatnonzero(well)[:16]
     normal, share, error = of_feet(robot, jax.tree.map(lambda v: v[chosen], run))
     down = normal > 1
@@ -98,11 +108,9 @@ def main() -> None:
     print(f"feet on the ground {down.mean():.1%} of samples, of which {sliding:.2%} slide; plant ")
     print(f"against the C engine, a control period: {error.max():.2g} m, rad", flush=True)
     states = on_c_engine(controller, x, steps)
-    speed = (states[-1, 0] - states[half, 0]) / ((steps - half) * robot.dt)
     apart = np.abs(states - alone)[:, :3].max()
-    print(
-        f"with the C engine as plant: {speed:.4f} m/s, trunk at most {apart:.2g} m from the other's"
-    )
+    print(f"with the C engine as plant: {motion(states, half, robot.dt)}, trunk at most ", end="")
+    print(f"{apart:.2g} m from the other's")
     if given.film:
         film(given.film, robot, run, size / max(given.push, 1e-9), well)
 

@@ -14,13 +14,21 @@ from jaxmpc.checks import fail, number, require_kind, require_shape, require_sym
 from jaxmpc.closed_loop.feedback import one_state
 from jaxmpc.closed_loop.robot_controller import FORCES, softened_limits
 from jaxmpc.mpc.controller import zeros_of
-from jaxmpc.mpc.plan import Control, Plan, WarmStart, applied, require_before
+from jaxmpc.mpc.plan import (
+    Control,
+    Plan,
+    WarmStart,
+    applied,
+    checked_array,
+    reference_shapes,
+    require_before,
+)
 from jaxmpc.mpc.problem import MPC, Soft, as_tuple
 from jaxmpc.mpc.rows import layout
 from jaxmpc.mpc.stagewise.solve import solve_stagewise
 from jaxmpc.pytrees import prepared_pytree, static
 from jaxmpc.qp.admm import ADMM, DEFAULT
-from jaxmpc.qp.linalg import arrays, floating_dtype
+from jaxmpc.qp.linalg import arrays, floating_dtype, matmul
 from jaxmpc.robots.contacts import STANDING
 from jaxmpc.robots.force_limits import force_limits
 from jaxmpc.robots.gaits import Gait
@@ -49,7 +57,8 @@ class GaitController:
 
     At each control period the problem has the linear models of the next N, the motion of the gait
     as reference, hard limits of inputs, and as soft rows friction cones and state limits. What
-    follows the horizon costs what it does under the periodic LQR of the gait.
+    follows the horizon costs what it does under the periodic LQR of the gait. Coordinates of the
+    problem, and axes of Q, are relative to the path of the trunk (`gait.relative`).
 
     gait: from `jm.robots.gait`. Q (n, n) or its diagonal (n,), R (m, m) or (m,): weights of the
       distances from the motion and from the torques of rest.
@@ -61,8 +70,8 @@ class GaitController:
     margin: fraction by which state limits are tightened, as in `robot_mpc`.
 
     `controller(x, before)` as `RobotController`. The reference is `gait.reference`, unless another
-    is given. Raises ValueError for arguments that do not fit together, and for gaits whose LQR does
-    not exist.
+    is given, in ξ too. Raises ValueError for arguments that do not fit together, for gaits whose
+    LQR does not exist, and for limits of the trunk's place or orientation where it turns.
     """
 
     gait: Gait
@@ -71,6 +80,7 @@ class GaitController:
     rho: Any
     cost_to_go: Any
     horizon: int = static(default=1)
+    place_limited: bool = static(default=False)
 
     def __init__(
         self,
@@ -96,6 +106,8 @@ class GaitController:
         require_symmetric_psd("R", R, definite=True)
         if solver is not None:
             require_kind("solver", solver, ADMM)
+        limited = np.any(np.isfinite(np.array(robot.state_limits.bounds())), axis=0)
+        _require_free_trunk(gait, limited)
         P = periodic_cost_to_go(gait, Q, R)
         first = {name: v[0] for name, v in _matrices(gait).items()}
         limits = MPC(
@@ -111,6 +123,7 @@ class GaitController:
             limits = replace(limits, outputs=replace(forces, stages=tuple(range(horizon))))
         vars(self).update(gait=arrays(gait), mpc=arrays(softened_limits(limits, rho)), rho=rho)
         vars(self).update(solver=arrays(solver), cost_to_go=jnp.asarray(P), horizon=horizon)
+        vars(self).update(place_limited=bool(limited[:2].any()))
         self.problem(jnp.int32(0)).validate()
 
     def __repr__(self) -> str:
@@ -154,12 +167,24 @@ class GaitController:
         names = self.robot.predictor.feet.cone_names
         friction = Soft(cones.C, None, cones.upper, weight, 0.0, cones.D, tuple(range(N)), names)
         last = self.cost_to_go[(time + N) % gait.period]
+        limits = as_tuple("soft", self.mpc.soft, Soft)
+        if self.place_limited:
+            limits = tuple(self._relative(rows, time) for rows in limits)
         return replace(
             self.mpc,
             system=replace(self.mpc.system, **system),
-            soft=(*as_tuple("soft", self.mpc.soft, Soft), friction),
+            soft=(*limits, friction),
             terminal_cost=last,
         )
+
+    def _relative(self, rows: Soft, time: Array) -> Soft:
+        """Return limits of ξ as those of the coordinates relative to a straight path, which differ
+        from stage to stage."""
+        path = self.gait.path
+        seconds = (time + np.array(rows.stages)) * self.robot.dt
+        away = matmul(path.places(path.home, seconds) - path.home, jnp.asarray(rows.C)[:, :2].T)
+        lower, upper = rows.sides
+        return replace(rows, lower=lower - away, upper=upper - away)
 
     def numbers_at(self, t: Any) -> dict[str, Any]:
         """Return which feet stand at the control period t of the motion, as a number of the
@@ -170,6 +195,12 @@ class GaitController:
         """Return what is tracked at the control period t where no other reference is given: ξ (n,)
         and the torques of rest (m,)."""
         return self.gait.reference(1, t)[0], self.gait.inputs
+
+    def distance(self, x: Array, xi: Array, t: Any) -> Array:
+        """Return the distance (n,) of a state x from ξ in the coordinates that are weighed at the
+        control period t."""
+        relative = partial(self.gait.relative, t=t)
+        return relative(x) - relative(self.robot.state(xi))
 
     def begun(self, before: Control[Plan], t: int) -> Control[Plan]:
         """Return what `start` gives for loops whose first plan begins at the control period t."""
@@ -202,17 +233,34 @@ class GaitController:
         problem = self.problem(time)
         rows = layout(problem)
         last = None if memory is None else memory.plan
+        gait, times = self.gait, time + jnp.arange(self.horizon + 1)
         if reference is None:
-            reference = self.gait.reference(self.horizon + 1, time)
+            aim = jnp.asarray(gait.states)[times % gait.period]
+        else:
+            given = checked_array("reference", reference, reference_shapes(self.mpc)["reference"])
+            given = jnp.broadcast_to(given, (self.horizon + 1, self.robot.n))
+            aim = jax.vmap(lambda xi, t: gait.relative(self.robot.state(xi), t))(given, times)
         start = None if last is None else last.shifted(rows, last.inputs[-1])
         plan = solve_stagewise(
-            problem, self.coordinates(x), reference, self.solver, start,
-            input_reference=self.gait.inputs if input_reference is None else input_reference,
+            problem, gait.relative(x, time), aim, self.solver, start,
+            input_reference=gait.inputs if input_reference is None else input_reference,
         )  # fmt: skip
         control = applied(problem, rows, plan, last)
         assert control.memory is not None
         later: Any = GaitMemory(control.memory, time + 1)
-        return control._replace(memory=later)
+        plan = replace(plan, states=jax.vmap(gait.in_the_world)(plan.states, times))
+        return Control(control.u, plan, later)
+
+
+def _require_free_trunk(gait: Gait, limited: np.ndarray) -> None:
+    """Raise ValueError where the trunk turns and what turns with it is limited in the axes of the
+    world; limited (n,): whether each coordinate ξ is."""
+    robot = gait.robot
+    turning = np.arange(robot.n)[[0, 1, 3, 4, 5, robot.mujoco.nv, robot.mujoco.nv + 1]]
+    found = [robot.state_names[i] for i in turning if limited[i]]
+    if np.any(gait.path.turn != 0) and found:
+        what = f"turns, and {robot.name} has limits of {', '.join(found)}"
+        fail("gait", what, "Load the robot without these (position=, velocity=), or let turn be 0")
 
 
 def periodic_cost_to_go(gait: Gait, Q: np.ndarray, R: np.ndarray) -> np.ndarray:

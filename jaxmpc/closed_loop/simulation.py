@@ -360,10 +360,13 @@ class Loop:
         """Return (x − r)'Q(x − r) + (u − s)'R(u − s), r and s the references at step t, those of
         the controller's own motion where none are given."""
         r, s = self.references(t)
-        if hasattr(self.controller, "motion"):
-            own_r, own_s = self.controller.motion(t)
-            r, s = own_r if r is None else r, own_s if s is None else s
-        error = _distance(self.controller.coordinates(x), r)
+        controller: Any = self.controller
+        if hasattr(controller, "motion"):
+            own_r, own_s = controller.motion(t)
+            r, s = own_r if r is None else first_row(r, x.dtype), own_s if s is None else s
+            error = controller.distance(x, r, t)
+        else:
+            error = _distance(controller.coordinates(x), r)
         effort = _distance(u, s)
         return jnp.sum(error * matmul(self.Q, error)) + jnp.sum(effort * matmul(self.R, effort))
 

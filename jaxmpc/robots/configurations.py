@@ -63,7 +63,7 @@ def retract(joints: Sequence[int], q: Array, dq: Array) -> Array:
     if not quaternions(joints):
         return q + dq
     parts = [
-        _product(q[place], _exponential(dq[motion])) if turns else q[place] + dq[motion]
+        product(q[place], _exponential(dq[motion])) if turns else q[place] + dq[motion]
         for place, motion, turns in blocks(joints)
     ]
     return jnp.concatenate(parts)
@@ -74,7 +74,7 @@ def difference(joints: Sequence[int], start: Array, end: Array) -> Array:
     if not quaternions(joints):
         return end - start
     parts = [
-        _logarithm(_product(_inverse(start[place]), end[place]))
+        _logarithm(product(_inverse(start[place]), end[place]))
         if turns
         else end[place] - start[place]
         for place, _, turns in blocks(joints)
@@ -88,7 +88,7 @@ def rates(joints: Sequence[int], q: Array, dq: Array) -> Array:
     if not quaternions(joints):
         return dq
     parts = [
-        2 * _product(_inverse(q[place]), dq[place])[1:] if turns else dq[place]
+        2 * product(_inverse(q[place]), dq[place])[1:] if turns else dq[place]
         for place, _, turns in blocks(joints)
     ]
     return jnp.concatenate(parts)
@@ -111,7 +111,7 @@ def _inverse(q: Array) -> Array:
     return q * jnp.array([1.0, -1.0, -1.0, -1.0], q.dtype)
 
 
-def _product(a: Array, b: Array) -> Array:
+def product(a: Array, b: Array) -> Array:
     """Return the Hamilton product a b of two quaternions."""
     vector = a[0] * b[1:] + b[0] * a[1:] + jnp.cross(a[1:], b[1:])
     return jnp.concatenate([(a[0] * b[0] - jnp.dot(a[1:], b[1:]))[None], vector])

@@ -23,6 +23,7 @@ Feet that stand in turn (`gaits.py`) are one model too: those that swing have no
 
 import copy
 import functools
+import warnings
 from collections.abc import Sequence
 from functools import partial
 from typing import Any
@@ -35,7 +36,7 @@ from scipy.linalg import block_diag
 
 from jaxmpc.checks import fail, number
 from jaxmpc.pytrees import record
-from jaxmpc.qp.linalg import matmul, solve
+from jaxmpc.qp.linalg import as_floats, matmul, solve
 from jaxmpc.robots.configurations import normalised, retract
 from jaxmpc.robots.description import RobotDescription
 from jaxmpc.robots.force_limits import ForceLimits
@@ -50,6 +51,8 @@ _NEAR, _TOUCHING = 2.5, 0.25
 _FRICTION = 0.8
 # Smallest motion of a foot, relative to the largest, that counts as one.
 _RANK = 1e-6
+# Faces of the friction cone of a foot.
+FACES = 5
 # Beside fields of mjx.Model: 1 for each foot (k,) that stands, 0 for one that swings.
 STANDING = "feet_standing"
 
@@ -88,7 +91,7 @@ class Feet:
         near, data = _with_margins(model, geoms), mujoco.MjData(model)
         data.qpos[:] = q
         mujoco.mj_forward(near, data)
-        frames, coefficients, rates = [], [], []
+        frames, coefficients, rates, depths = [], [], [], []
         for name, geom in zip(feet, geoms, strict=True):
             contact, sign = _ground_contact(model, data, geom)
             radius = model.geom_size[geom, 0]
@@ -96,6 +99,7 @@ class Feet:
                 away = "far" if contact is None else f"{contact.dist / radius:.3g} of its radius"
                 problem = f"geom {name} is {away} from the ground at home"
                 fail("feet", problem, "Give a home= in which the feet touch the ground")
+            depths.append(-contact.dist / radius)
             if contact.dim == 1 and friction != 0:
                 problem = f"geom {name} touches the ground without friction (condim 1)"
                 fail("feet", problem, "Write condim 3 in the file, or give friction=0")
@@ -104,6 +108,10 @@ class Feet:
             coefficient = _FRICTION * contact.friction[:2].min()
             coefficients.append(coefficient if friction is None else friction)
             rates.append(_rate(model, contact))
+        if max(depths) > _TOUCHING:
+            name, by = feet[np.argmax(depths)], max(depths)
+            text = f"geom {name} is {by:.2g} of its radius inside the ground at home"
+            warnings.warn(f"{text}, which pushes it out: move home up", stacklevel=2)
         return cls(
             names=tuple(feet),
             geoms=geoms,
@@ -131,16 +139,18 @@ class Feet:
 
     @property
     def cone_names(self) -> tuple[str, ...]:
-        """Return the names of the faces of the friction cones, four a foot."""
-        return tuple(f"friction cone of {name}" for name in self.names for _ in range(4))
+        """Return the names of the faces of the friction cones, five a foot."""
+        rows = (*4 * ("friction cone",), "push")
+        return tuple(f"{row} of {name}" for name in self.names for row in rows)
 
     def cones(self) -> np.ndarray:
-        """Return the faces (4k, 3k) of the friction cones, F λ ≤ 0: ±λ_1 ± λ_2 ≤ μ λ_n."""
+        """Return the faces (5k, 3k) of the friction cones, F λ ≤ 0: ±λ_1 ± λ_2 ≤ μ λ_n, and
+        0 ≤ λ_n, which follows but where μ is zero, or so small that breaking it costs little."""
         signs = [(1, 1), (1, -1), (-1, 1), (-1, -1)]
-        faces = np.zeros((len(self), 4, len(self), 3))
+        faces = np.zeros((len(self), FACES, len(self), 3))
         for i, mu in enumerate(self.friction):
-            faces[i, :, i] = [(-mu, *pair) for pair in signs]
-        return faces.reshape(4 * len(self), 3 * len(self))
+            faces[i, :, i] = [*((-mu, *pair) for pair in signs), (-1, 0, 0)]
+        return faces.reshape(FACES * len(self), 3 * len(self))
 
     def edges(self) -> np.ndarray:
         """Return the edges R (3k, 4k) of the friction cones, λ = R r with r ≥ 0: (1, ±μ, 0) and
@@ -215,7 +225,7 @@ class StandingPhysics(Physics):
         physics: Any = self.acting(numbers)
         if physics is not self:
             return physics.contact_forces(x, u, numbers)
-        x, u = jnp.asarray(x), jnp.asarray(u)
+        x, u = as_floats(x), as_floats(u)
         q, v, act = jnp.split(x, [self.model.nq, self.model.nq + self.model.nv])
         return self._standing(in_force(numbers), normalised(self.joints, q), v, act, u)[1]
 
@@ -322,7 +332,7 @@ def friction_cones(robot: RobotDescription, x: Any, u: Any) -> ForceLimits | Non
 def linear_cones(
     robot: RobotDescription, numbers: dict[str, Array], xi: Array, u: Array
 ) -> tuple[Array, Array, Array]:
-    """Return C (4k, n), D (4k, m) and the upper sides (4k,) of the friction cones, linearised at ξ
+    """Return C (5k, n), D (5k, m) and the upper sides (5k,) of the friction cones, linearised at ξ
     and u. numbers: as in `Robot.linearize`, with `STANDING`."""
     physics: Any = robot.predictor
 

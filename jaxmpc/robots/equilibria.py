@@ -284,14 +284,18 @@ def require_rest(
     touching: where contacts or stops do, return the sentence instead.
     """
     plant, smooth = robot.mujoco, robot.predictor.model
-    if hasattr(robot.predictor, "feet"):
-        return []  # MuJoCo's contacts are springs, into which a robot sinks first
+    feet = getattr(robot.predictor, "feet", None)
     file = copy.deepcopy(robot.file or plant)
     # Inputs are not clamped, and of a motor's force limits the box of inputs is in charge.
     file.opt.disableflags |= flag("clampctrl")
     file.actuator_forcelimited[:] = plant.actuator_forcelimited
     file.jnt_actfrclimited[:] = plant.jnt_actfrclimited
     file.actuator_delay[:] = 0  # inputs at rest are old enough
+    if feet is not None:
+        # MuJoCo's contacts are springs, into which a robot sinks first: the rest is compared
+        # without feet in both models, in which it falls.
+        file.geom_contype[feet.geoms] = file.geom_conaffinity[feet.geoms] = 0
+        file.pair_margin[:] = -np.inf
     limited, single = file.jnt_limited.copy(), single_joints(file)
     at, dof = file.jnt_qposadr[single], file.jnt_dofadr[single]
     low, high = (end[dof] for end in robot.state_limits.bounds())
@@ -304,7 +308,8 @@ def require_rest(
             continue
         i = int(np.argmax(np.nan_to_num(np.abs(found - wanted), nan=np.inf)))
         joint = name_of(file, "joint", file.dof_jntid[i])
-        problem = f"{rest.q} is no rest: in MuJoCo {joint} accelerates by {found[i]:.3g} a second²"
+        more = (found - wanted)[i]
+        problem = f"{rest.q} is no rest: in MuJoCo {joint} accelerates by {more:.3g} a second²"
         for kind, cause, cure in CAUSES:
             without = _accelerations(_without(file, kind), rest)
             if np.all(np.abs(without - wanted) <= AT_REST):

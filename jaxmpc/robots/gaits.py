@@ -1,26 +1,34 @@
 """Gaits: feet that stand in turn under a trunk of constant velocity, and linear models along that.
 
 A foot stands for the part `duty` of each period, still on the ground, and swings for the rest, from
-where it left to where it stands next. So relative to the trunk, which moves with the velocity v, it
-goes back by v T duty and forward again, in an arc. Inverse kinematics gives the joints, their
-differences the velocities, and each control period of a period of the gait has a linear model of
-its own, with the contact forces of the feet that stand (`contacts.py`), and friction cones.
+where it left to where it stands next. The trunk moves along a line or a circle (`TrunkPath`), and
+relative to it a foot goes back by v T duty and forward again, in an arc. Inverse kinematics gives
+the joints, their differences the velocities, and each control period of a period of the gait has a
+linear model of its own, with the contact forces of the feet that stand (`contacts.py`), and
+friction cones.
 
-The motion is a reference: what a plan stays close to, not what it is bound to. Its linear models
-are exact in the inputs, since motions are affine in them.
+Coordinates are relative to the path: those of a state moved back to where the path begins, so that
+the motion repeats itself, wherever it has come to. A linear model goes from those of one control
+period to those of the next. The motion is a reference: what a plan stays close to, not what it is
+bound to. Its linear models are exact in the inputs but for the turn of the trunk, since motions are
+affine in them.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
-from jaxmpc.checks import fail, number, require_finite, require_kind, require_shape
-from jaxmpc.pytrees import pytree, static
+from jaxmpc.checks import concrete, fail, number, require_finite, require_kind, require_shape
+from jaxmpc.pytrees import named_pytree, pytree, static
 from jaxmpc.qp.jax_transformations import compiled_lightly
-from jaxmpc.robots.contacts import STANDING, linear_cones
+from jaxmpc.qp.linalg import as_floats, matmul
+from jaxmpc.robots.configurations import product
+from jaxmpc.robots.contacts import FACES, STANDING, linear_cones
 from jaxmpc.robots.description import host_coordinates
 from jaxmpc.robots.mujoco_access import FREE, mujoco, single_joints
 from jaxmpc.robots.robot import Robot
@@ -33,7 +41,7 @@ _STEPS, _REACHED = 100, 1e-9
 
 
 class Cones(NamedTuple):
-    """Friction cones of feet, C ξ + D u ≤ upper: C (P, 4k, n), D (P, 4k, m), upper (P, 4k), ∞ in
+    """Friction cones of feet, C ξ + D u ≤ upper: C (P, 5k, n), D (P, 5k, m), upper (P, 5k), ∞ in
     the rows of feet that swing."""
 
     C: Any
@@ -41,20 +49,54 @@ class Cones(NamedTuple):
     upper: Any
 
 
+@named_pytree
+class TrunkPath(NamedTuple):
+    """How the trunk moves in the plane, from `home` (2,) on: with the velocity (2,) along x and y,
+    m/s, both of which turn with it at the rate `turn`, rad/s.
+
+    A motion of constant twist: what it does in −t seconds is the inverse of what it does in t."""
+
+    velocity: Any
+    turn: Any
+    home: Any
+
+    def places(self, places: Any, seconds: Any) -> Array:
+        """Return places (..., 2) moved with the trunk for so many seconds (...)."""
+        half = self.turn * seconds / 2
+        length = seconds * jnp.sinc(half / np.pi)
+        moved = self.home + length[..., None] * _rotated(self.velocity, half)
+        return moved + _rotated(places - self.home, 2 * half)
+
+    def state(self, x: Array, nq: int, seconds: Any) -> Array:
+        """Return the state x = (qpos (nq,), qvel, act) of a robot with a free base moved with the
+        trunk for so many seconds."""
+        half, speeds = self.turn * seconds / 2, slice(nq, nq + 2)
+        zero = jnp.zeros_like(half)
+        heading = product(jnp.stack([jnp.cos(half), zero, zero, jnp.sin(half)]), x[3:7])
+        x = x.at[:2].set(self.places(x[:2], seconds)).at[3:7].set(heading)
+        return x.at[speeds].set(_rotated(x[speeds], 2 * half))
+
+
+def _rotated(vectors: Any, angle: Any) -> Array:
+    """Return vectors (..., 2) turned by an angle, rad."""
+    x, y, cos, sin = vectors[..., 0], vectors[..., 1], jnp.cos(angle), jnp.sin(angle)
+    return jnp.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
+
+
 @pytree
 class Gait:
     """A motion that repeats itself after P control periods, from `gait`.
 
-    robot: with the model of these feet. standing (P, k): whether each foot stands. states (P, n):
-    coordinates ξ; advance (n,): by which they differ a period later. inputs (m,): torques of rest.
-    system: linear models, A (P, n, n), B (P, n, m), c (P, n), from one control period to the next.
-    cones: of the feet that stand.
+    robot: with the model of these feet. path: of the trunk. standing (P, k): whether each foot
+    stands. states (P, n): coordinates relative to the path. inputs (m,): torques of rest. system:
+    linear models of these coordinates, A (P, n, n), B (P, n, m), c (P, n), from one control period
+    to the next. cones: of the feet that stand.
     """
 
     robot: Robot
+    path: TrunkPath
     standing: Any
     states: Any
-    advance: Any
     inputs: Any
     system: LinearSystem
     cones: Cones
@@ -66,9 +108,29 @@ class Gait:
         return int(np.shape(self.states)[0])
 
     def reference(self, count: int, start: Any = 0) -> Any:
-        """Return the coordinates (count, n) from the control period `start` on."""
-        steps = start + np.arange(count)
-        return self.states[steps % self.period] + (steps // self.period)[:, None] * self.advance
+        """Return the coordinates ξ (count, n) of the motion from the control period `start` on."""
+        if not concrete(start, self.states):
+            steps = start + jnp.arange(count)
+            return jax.vmap(self.in_the_world)(jnp.asarray(self.states)[steps % self.period], steps)
+        with jax.enable_x64(True):
+            steps = start + np.arange(count)
+            states = np.asarray(self.states, float)[steps % self.period]
+            return np.asarray(jax.vmap(self.in_the_world)(states, steps))
+
+    def relative(self, x: Array, t: Any) -> Array:
+        """Return the coordinates (n,), relative to the path, of a state x (nq + nv + na,) at the
+        control period t."""
+        return self.robot.coordinates(self._moved(x, -t))
+
+    def in_the_world(self, relative: Array, t: Any) -> Array:
+        """Return the coordinates ξ (n,) that these are at the control period t."""
+        return self.robot.coordinates(self._moved(self.robot.state(relative), t))
+
+    def _moved(self, x: Array, t: Any) -> Array:
+        x = as_floats(x)
+        seconds = jnp.asarray(t * self.robot.dt, x.dtype)
+        path = jax.tree.map(lambda v: jnp.asarray(v, x.dtype), self.path)
+        return path.state(x, self.robot.mujoco.nq, seconds)
 
 
 def gait(
@@ -76,6 +138,7 @@ def gait(
     feet: Sequence[str],
     velocity: Sequence[float] = (0.5, 0.0),
     *,
+    turn: float = 0.0,
     period: float = 0.44,
     duty: float = 0.57,
     offsets: Sequence[float] | None = None,
@@ -87,7 +150,8 @@ def gait(
     Arguments:
         robot: with a free base, and legs of hinges and slides.
         feet: names of geoms, spheres that touch flat ground at home, one a leg.
-        velocity: of the trunk along x and y, m/s.
+        velocity: of the trunk along x and y, m/s; these turn with it.
+        turn: rate at which the trunk turns about z, rad/s, to the left where it is positive.
         period: seconds from one step of a foot to its next.
         duty: part of the period for which a foot stands, in (0, 1).
         offsets: when each foot begins to stand, in parts of the period. None: every other foot
@@ -106,6 +170,8 @@ def gait(
         fail("robot", f"{robot.name} has other joints", "Give a free base, then hinges and slides")
     require_shape("velocity", velocity, (2,), "Along x and y, in m/s")
     require_finite("velocity", velocity)
+    require_shape("turn", turn, (), "A number, in rad/s")
+    require_finite("turn", turn)
     for name, value in (("period", period), ("lift", lift)):
         number(name, value, np.finfo(float).tiny, "Give a positive number")
     if not 0 < duty < 1:
@@ -115,7 +181,9 @@ def gait(
         fail("period", f"{period} s is {count} control periods", "Give at least 4 of them")
     try:
         x_rest, u_rest = standing_robot.equilibrium()
-    except ValueError:  # which says what is missing
+    except ValueError as error:
+        if "no input balances" not in str(error):
+            raise
         cure = "Name all feet that touch the ground, and put home's centre of mass above them"
         fail("feet", f"{', '.join(feet)} do not carry {robot.name} at home", cure)
     places = _places(model, x_rest[: model.nq], feet)
@@ -130,28 +198,30 @@ def gait(
     phases = (np.arange(count)[:, None] / count - starts) % 1.0
     standing = phases < duty - 1e-9
     _require_swings(feet, standing, duty)
-    steps = np.append(velocity, 0.0) * count * robot.dt * duty
-    away = steps * _along(phases, duty)[:, :, None] + [0, 0, lift] * _arc(phases, duty)[:, :, None]
-    q = _joints(robot, x_rest[: model.nq], feet, places + away)
+    path = TrunkPath(np.asarray(velocity, float), np.asarray(turn, float), x_rest[:2])
+    goals = np.empty((count, len(feet), 3))
+    goals[:, :, :2] = _paths(path, places[:, :2], phases, duty, count * robot.dt * duty)
+    goals[:, :, 2] = places[:, 2] + lift * _arc(phases, duty)
+    q = _joints(robot, x_rest[: model.nq], feet, goals)
     joints = q[:, 7:]
     speeds = (np.roll(joints, -1, axis=0) - np.roll(joints, 1, axis=0)) / (2 * robot.dt)
     v = np.zeros((count, model.nv))
     v[:, :2], v[:, 6:] = velocity, speeds
-    q[:, :2] += np.arange(count)[:, None] * robot.dt * np.asarray(velocity, float)
+    _require_slow(robot, speeds)
+    # (Angular velocities of a free base are in its own frame.)
+    v[:, 3:6] = turn * _upwards(x_rest[3:7])
     rest = np.broadcast_to(x_rest[model.nq + model.nv :], (count, model.na))
     states = host_coordinates(robot, np.hstack([q, v, rest]))
-    advance = np.zeros(robot.n)
-    advance[:2] = np.asarray(velocity, float) * count * robot.dt
 
     with jax.enable_x64(True):
         given = (jnp.asarray(v, float) for v in (states, u_rest, standing))
-        system, (C, D, upper) = jax.tree.map(np.asarray, _models(standing_robot, *given))
-    faces = np.repeat(standing, 4, axis=1)
+        system, (C, D, upper) = jax.tree.map(np.asarray, _models(standing_robot, path, *given))
+    faces = np.repeat(standing, FACES, axis=1)
     return Gait(
         robot=standing_robot,
+        path=path,
         standing=standing,
         states=states,
-        advance=advance,
         inputs=u_rest,
         system=system,
         cones=Cones(C, D, np.where(faces, upper, np.inf)),
@@ -181,15 +251,46 @@ def _require_swings(feet: Sequence[str], standing: np.ndarray, duty: float) -> N
             fail("duty", what, f"Let it stand at 1 of them and swing at {_SWING} at least: {by}")
 
 
+def _require_slow(robot: Robot, speeds: np.ndarray) -> None:
+    """Raise ValueError where the speeds (P, nv − 6) of joints pass their limits."""
+    first = robot.mujoco.nv + 6
+    lower, upper = (end[first : first + speeds.shape[1]] for end in robot.state_limits.bounds())
+    over = np.maximum(lower - speeds, speeds - upper).max(axis=0)
+    worst = int(np.argmax(over))
+    if over[worst] > 0:
+        name, most = robot.state_names[first + worst], np.abs(speeds[:, worst]).max()
+        problem = f"{name} would be {most:.3g}, its limits are [{lower[worst]:g}, {upper[worst]:g}]"
+        fail("velocity", problem, "Give a smaller velocity, turn or lift, or a longer period")
+
+
+def _upwards(quaternion: np.ndarray) -> np.ndarray:
+    """Return the direction z (3,) of the world in the frame of a body with this orientation."""
+    matrix = np.empty(9)
+    mujoco.mju_quat2Mat(matrix, quaternion)
+    return matrix.reshape(3, 3)[2]
+
+
 @compiled_lightly(0)
-def _models(robot: Robot, states: Any, u: Any, standing: Any) -> tuple[LinearSystem, tuple]:
-    """Return the linear models (P, ...) and the friction cones at states ξ (P, n) of rows of feet
-    that stand."""
+def _models(
+    robot: Robot, path: TrunkPath, states: Any, u: Any, standing: Any
+) -> tuple[LinearSystem, tuple]:
+    """Return the linear models (P, ...) and the friction cones at relative coordinates (P, n) of
+    rows of feet that stand."""
+
+    def moved_back(xi: Array) -> tuple[Array, Array]:
+        back = jnp.asarray(-robot.dt, xi.dtype)
+        relative = robot.coordinates(path.state(robot.state(xi), robot.mujoco.nq, back))
+        return relative, relative
 
     def at(xi: Any, stands: Any) -> tuple[LinearSystem, tuple]:
         numbers = {STANDING: stands}
         system = robot.linearize(robot.state(xi), u, exact=True, numbers=numbers)
-        return system, linear_cones(robot, numbers, xi, u)
+        A, B, c = (jnp.asarray(v) for v in (system.A, system.B, system.c))
+        after = matmul(A, xi) + matmul(B, u) + c
+        J, relative = jax.jacfwd(moved_back, has_aux=True)(after)
+        A, B = matmul(J, A), matmul(J, B)
+        c = relative - matmul(A, xi) - matmul(B, u)
+        return replace(system, A=A, B=B, c=c), linear_cones(robot, numbers, xi, u)
 
     return jax.vmap(at)(states, standing)
 
@@ -200,6 +301,19 @@ def _alternating(places: np.ndarray) -> np.ndarray:
     starts = np.zeros(len(places))
     starts[order[1::2]] = 0.5
     return starts
+
+
+def _paths(
+    path: TrunkPath, places: np.ndarray, phases: np.ndarray, duty: float, stance: float
+) -> np.ndarray:
+    """Return where feet with these places (k, 2) under the trunk at rest are relative to it, in x
+    and y (P, k, 2): while they stand the trunk moves on for `stance` seconds."""
+    along = _along(phases, duty)
+    with jax.enable_x64(True):
+        moved = lambda part: np.asarray(path.places(places, jnp.asarray(part * stance)))
+        back, front, stands = moved(-0.5), moved(0.5), moved(along)
+    swings = back + (0.5 + along)[:, :, None] * (front - back)
+    return np.where(phases[:, :, None] < duty, stands, swings)
 
 
 def _along(phases: np.ndarray, duty: float) -> np.ndarray:
@@ -254,7 +368,7 @@ def _joints(robot: Robot, home: np.ndarray, feet: Sequence[str], goals: np.ndarr
             problem = f"joint {model.joint(joint).name} would pass its limits"
         if problem:
             along, up = np.abs(goal - at_home).max(axis=0)[:2].max(), (goal - at_home)[:, 2].max()
-            cure = "Give a smaller velocity, lift, or a shorter period"
+            cure = "Give a smaller velocity, turn or lift, or a shorter period"
             fail("lift" if up > along else "velocity", problem, cure)
         found.append(q.copy())
     return np.array(found)

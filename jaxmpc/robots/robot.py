@@ -299,7 +299,8 @@ class Robot(RobotDescription):
         Linear models, `equilibrium` and `set_point` hold the feet still by contact forces, and
         `robot_mpc` has the friction cones as rows: see `jaxmpc/robots/contacts.py`.
 
-        Raises ValueError for geoms that are no spheres or do not touch within 5 mm, for models
+        Raises ValueError for geoms that are no spheres or further than a quarter of their radius
+        from the ground, and warns of those that are as deep in it; ValueError too for models
         with equalities or the integrator RK4, and where the feet hold one another.
         """
         return replace(self, predictor=standing_physics(self, feet, friction))

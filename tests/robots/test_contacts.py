@@ -3,6 +3,7 @@ statics against a linear program, and what is refused."""
 
 import copy
 import importlib.util
+import re
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -302,3 +303,47 @@ def test_pushed_quadrupeds_stand():
     late = slice(60, None)
     np.testing.assert_allclose(normal[:, late].sum(axis=2), 9.81 * rest.mass, rtol=0.1)
     assert share[:, late][normal[:, late] > 1].max() < 0.9
+
+
+def test_feet_without_friction_push_and_do_not_pull():
+    """At any friction the rows say so: λ_n ≥ 0 follows from |λ_1| + |λ_2| ≤ μ λ_n unless μ = 0."""
+    for friction in (0.0, 1e-6, 0.5):
+        feet = hopper().standing(["foot"], friction=friction).predictor.feet
+        faces = feet.cones()
+        assert len(faces) == len(feet.cone_names)
+        assert np.max(faces @ [-40.0, 0, 0]) >= 40
+        assert np.max(faces @ [40.0, 0, 0]) <= 0
+
+
+@pytest.mark.parametrize("strength", [100, 1])
+def test_a_rest_on_feet_keeps_the_force_limits_of_servos(strength):
+    """Of 5 N m that the knees need. (MuJoCo's C engine says what the servos give.)"""
+    servo = rf'<position name="\1" joint="\1" kp="100" forcerange="-{strength} {strength}"/>'
+    text = re.sub(r'<motor name="(\w+)"[^>]*>', servo, QUADRUPED.read_text())
+    robot = jm.load_robot(mujoco.MjModel.from_xml_string(text)).standing(FEET)
+    if strength == 1:
+        with pytest.raises(ValueError, match="limits of actuators' forces .forcerange"):
+            robot.equilibrium()
+        return
+    x, u = robot.equilibrium()
+    data = mujoco.MjData(robot.mujoco)
+    data.qpos[:], data.ctrl[:] = x[: robot.mujoco.nq], u
+    mujoco.mj_forward(robot.mujoco, data)
+    assert 1 < np.abs(data.actuator_force).max() < strength
+
+
+def test_what_else_touches_takes_the_rest_away():
+    """A shape of the trunk on the ground, which the model has not."""
+    text = QUADRUPED.read_text()
+    ball = '<geom name="belly" type="sphere" size=".05" pos="0 0 -.25" contype="1"/>'
+    at = text.index("<freejoint")
+    robot = jm.load_robot(mujoco.MjModel.from_xml_string(text[:at] + ball + text[at:]))
+    with pytest.raises(ValueError, match="by contacts. Choose a configuration in which nothing"):
+        robot.standing(FEET).equilibrium()
+
+
+def test_feet_deep_in_the_ground_are_named():
+    text = QUADRUPED.read_text().replace('qpos="0 0 .283', 'qpos="0 0 .272')
+    robot = jm.load_robot(mujoco.MjModel.from_xml_string(text))
+    with pytest.warns(UserWarning, match=r"geom FL is 0.5\d* of its radius inside the ground"):
+        robot.standing(FEET, friction=0.51)

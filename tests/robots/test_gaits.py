@@ -2,19 +2,24 @@
 stand, the periodic LQR against lifted Riccati equations, and a quadruped that trots in MuJoCo."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 import scipy
+from scipy.spatial.transform import Rotation
 
 import jaxmpc as jm
 from jaxmpc.closed_loop import GaitController, KalmanFilter
-from jaxmpc.closed_loop.gait_controller import periodic_cost_to_go
+from jaxmpc.closed_loop.gait_controller import _require_free_trunk, periodic_cost_to_go
 from jaxmpc.robots.contacts import STANDING
+from jaxmpc.robots.gaits import TrunkPath, _paths
+from jaxmpc.robots.robot import RobotModel
 
 QUADRUPED = Path(__file__).parents[2] / "experiments" / "robots" / "quadruped.xml"
 FEET = ("FL", "FR", "RL", "RR")
@@ -104,7 +109,7 @@ def test_weights_and_solvers_that_do_not_fit_are_named(given, text):
     """Before the LQR is looked for."""
     gait = random_gait(np.random.default_rng(2), 3, same=True)
     stand_in = jm.robots.Gait(
-        SimpleNamespace(n=3, m=2), None, np.zeros((3, 3)), None, None, gait.system, None
+        SimpleNamespace(n=3, m=2), None, None, np.zeros((3, 3)), None, gait.system, None
     )
     with pytest.raises(ValueError, match=text):
         GaitController(stand_in, **{"Q": np.ones(3), "R": np.ones(2), **given})
@@ -172,6 +177,12 @@ def test_limits_of_the_caller_are_those_of_joints():
         jm.robots.gait(robot, FEET)
 
 
+def test_motions_keep_the_velocity_limits():
+    robot = jm.load_robot(QUADRUPED, control_period=0.01, velocity=1.0)
+    with pytest.raises(ValueError, match=r"velocity: .* velocity would be \d.*, its limits are"):
+        jm.robots.gait(robot, FEET, (0.5, 0.0))
+
+
 @pytest.mark.long
 def test_servos_keep_their_force_limits():
     """`forcerange` is a row of the plans; at the first stage the input is within it."""
@@ -225,8 +236,10 @@ def test_observers_know_which_feet_stand(gait):
         told, all_feet = (
             np.asarray(observer.predicted(belief, u, None, given).mean) for given in (numbers, {})
         )
-    A, B, c = (np.asarray(v)[5] for v in (gait.system.A, gait.system.B, gait.system.c))
-    np.testing.assert_allclose(told, A @ xi + B @ u + c, atol=1e-5)
+        A, B, c = (np.asarray(v)[5] for v in (gait.system.A, gait.system.B, gait.system.c))
+        # (The model's coordinates go on with the trunk.)
+        after = np.asarray(gait.in_the_world(jnp.asarray(A @ xi + B @ u + c), 1))
+    np.testing.assert_allclose(told, after, atol=1e-5)
     assert np.abs(all_feet - told).max() > 0.1
 
 
@@ -265,12 +278,13 @@ def test_linear_models_are_those_of_the_feet_that_stand(robot, gait):
         x = robot.state(gait.states[phase])
         expected = two.linearize(x, gait.inputs, exact=True)
         forces = np.asarray(two.predictor.contact_forces(x, gait.inputs))
-    system = gait.system
-    for name in ("A", "B", "c"):
-        found = np.asarray(getattr(system, name)[phase])
-        np.testing.assert_allclose(found, getattr(expected, name), atol=1e-9)
+    A, B, c = (np.asarray(getattr(gait.system, name)[phase]) for name in ("A", "B", "c"))
+    np.testing.assert_allclose(A, expected.A, atol=1e-9)
+    np.testing.assert_allclose(B, expected.B, atol=1e-9)
+    way = np.eye(robot.n)[0] * SPEED * robot.dt  # coordinates are relative to the trunk's path
+    np.testing.assert_allclose(c, np.asarray(expected.c) - way, atol=1e-9)
     C, D, upper = (np.asarray(v[phase]) for v in gait.cones)
-    rows = np.repeat(gait.standing[phase], 4)
+    rows = np.repeat(gait.standing[phase], 5)
     assert np.all(np.isinf(upper[~rows])) and not C[~rows].any() and not D[~rows].any()
     violation = (C @ gait.states[phase] + D @ gait.inputs - upper)[rows]
     np.testing.assert_allclose(violation, two.predictor.feet.cones() @ forces, atol=1e-8)
@@ -301,3 +315,168 @@ def test_a_quadruped_trots_in_mujoco(robot, gait):
     assert np.ptp(states[:, 2]) < 0.01 and np.abs(states[:, 4:6]).max() < 0.02
     assert np.abs(states[:, 1]).max() < 0.02
     np.testing.assert_allclose(run.states, states, atol=1e-6)
+
+
+def turned(x, nq, angle, shift=(0.0, 0.0)):
+    """The state of a robot with a free base turned about z through the origin, then shifted."""
+    turn = Rotation.from_euler("z", angle)
+    place, speed = (turn.apply(part) for part in (x[:3], x[nq : nq + 3]))
+    w, *v = x[3:7]
+    *v, w = (turn * Rotation.from_quat([*v, w])).as_quat()
+    return np.concatenate([place + [*shift, 0], [w, *v], x[7:nq], speed, x[nq + 3 :]])
+
+
+@pytest.mark.parametrize(("velocity", "turn"), [((0.4, -0.2), 0.7), ((0.5, 0.1), 0.0)])
+def test_paths_are_those_of_the_velocity(velocity, turn):
+    """By small steps along it; moved back, a place is where it was."""
+    path, home = TrunkPath(np.array(velocity), np.array(turn), np.array([0.3, -0.1])), [0.3, -0.1]
+    p, count, seconds = np.array(home), 20_000, 3.0
+    for k in range(count):
+        angle = turn * (k + 0.5) * seconds / count
+        p = p + seconds / count * Rotation.from_euler("z", angle).apply([*velocity, 0])[:2]
+    with jax.enable_x64(True):
+        np.testing.assert_allclose(path.places(np.array(home), jnp.asarray(seconds)), p, atol=1e-8)
+        other = np.array([[0.5, 0.2], [-1.0, 2.0]])
+        there = path.places(other, jnp.asarray(seconds))
+        arm = Rotation.from_euler("z", turn * seconds).apply([0.2, 0.3, 0])[:2]
+        np.testing.assert_allclose(there[0], p + arm, atol=1e-8)
+        np.testing.assert_allclose(path.places(there, jnp.asarray(-seconds)), other, atol=1e-12)
+
+
+@pytest.mark.parametrize("turn", [0.0, 1.5])
+def test_feet_under_the_trunk_stand_still_in_the_world(turn):
+    """Where they step to is where they stand next."""
+    path = TrunkPath(np.array([0.5, 0.1]), np.array(turn), np.zeros(2))
+    count, dt, duty = 40, 0.01, 0.6
+    starts = np.array([0.0, 0.5])
+    phases = (np.arange(3 * count)[:, None] / count - starts) % 1.0
+    standing = phases < duty - 1e-9
+    seen = _paths(path, np.array([[0.2, 0.1], [-0.2, -0.1]]), phases, duty, count * dt * duty)
+    with jax.enable_x64(True):
+        world = np.array([path.places(p, jnp.asarray(k * dt)) for k, p in enumerate(seen)])
+    moved = np.abs(np.diff(world, axis=0)).max(axis=2)
+    assert moved[standing[1:] & standing[:-1]].max() < 1e-12
+    assert moved[~standing[1:] & ~standing[:-1]].max() > 0.01
+
+
+def test_turning_trunks_have_no_limits_in_the_world():
+    robot = jm.load_robot(QUADRUPED, control_period=0.01)
+    limits = np.full((2, robot.n), [[-np.inf], [np.inf]])
+    limits[:, 18] = -1.0, 1.0
+    limited = np.isfinite(limits).any(axis=0)
+    gait = SimpleNamespace(robot=robot, path=TrunkPath(np.zeros(2), np.array(0.5), np.zeros(2)))
+    with pytest.raises(ValueError, match=r"gait: turns, and quadruped has limits of .*velocity"):
+        _require_free_trunk(gait, limited)
+    _require_free_trunk(SimpleNamespace(robot=robot, path=gait.path._replace(turn=0.0)), limited)
+
+
+@pytest.fixture(scope="module")
+def turning(robot):
+    """A trot along a circle."""
+    return jm.robots.gait(robot, FEET, (0.4, 0.1), turn=0.8)
+
+
+@pytest.mark.slow
+def test_a_turning_motion_is_one_of_the_robot(robot, turning):
+    """Feet that stand stay; positions change by the velocities; the trunk's heading passes π."""
+    model, dt, count = robot.mujoco, robot.dt, 500
+    with jax.enable_x64(True):
+        x = np.array([robot.state(xi) for xi in turning.reference(count)])
+    feet = np.array([places(model, row[: model.nq]) for row in x])
+    standing = turning.standing[np.arange(count) % turning.period]
+    stay = standing[:-1] & standing[1:]
+    assert np.abs(np.diff(feet, axis=0))[stay].max() < 1e-8
+    heading = np.unwrap(2 * np.arctan2(x[:, 6], x[:, 3]))
+    np.testing.assert_allclose(heading, 0.8 * dt * np.arange(count), atol=1e-9)
+    assert heading[-1] > np.pi
+    found = np.zeros(model.nv)
+    for k in (3, 200, 450):  # of the trunk; joints stop and start
+        now, after = x[k], x[k + 1]
+        mujoco.mj_differentiatePos(model, found, dt, now[: model.nq], after[: model.nq])
+        mean = (now[model.nq :] + after[model.nq :]) / 2
+        np.testing.assert_allclose(found[:6], mean[:6], atol=1e-5)
+
+
+@pytest.mark.slow
+def test_models_of_a_turning_gait_by_differences(robot, turning):
+    """From the coordinates of one control period to those of the next."""
+    k, nq, rng = 7, robot.mujoco.nq, np.random.default_rng(0)
+    path, home = turning.path, np.append(turning.path.home, 0)
+    with jax.enable_x64(True):
+        shift = np.asarray(path.places(path.home, jnp.asarray(robot.dt))) - path.home
+        model = RobotModel(turning.robot, {STANDING: turning.standing[k].astype(float)})
+
+        def after(xi, u):
+            x = np.array(robot.state(model.step(xi, u)))
+            x[:3] -= home + [*shift, 0]  # the trunk's path begins at home
+            x = turned(x, nq, -path.turn * robot.dt)
+            x[:3] += home
+            return np.asarray(robot.coordinates(x))
+
+        xi, u, h = np.asarray(turning.states[k]), np.asarray(turning.inputs), 1e-6
+        A, B, c = (np.asarray(v)[k] for v in (turning.system.A, turning.system.B, turning.system.c))
+        np.testing.assert_allclose(A @ xi + B @ u + c, after(xi, u), atol=1e-12)
+        for _ in range(3):
+            d, e = rng.normal(size=robot.n), rng.normal(size=robot.m)
+            found = (after(xi + h * d, u + h * e) - after(xi - h * d, u - h * e)) / (2 * h)
+            np.testing.assert_allclose(A @ d + B @ e, found, atol=2e-6 * np.abs(found).max())
+
+
+@pytest.mark.slow
+def test_a_quadruped_trots_along_a_circle(robot, turning):
+    """In MuJoCo's C engine, and plans know no heading: those of the whole world turned and moved
+    with the path are the same, a period later."""
+    Q = np.repeat([100.0, 200, 400, 200, 100, 20, 1, 0.5, 0.02], [1, 1, 1, 2, 1, 12, 3, 3, 12])
+    nq, P, steps = robot.mujoco.nq, turning.period, 150
+    with jax.enable_x64(True):
+        controller = GaitController(turning, Q, np.full(12, 1e-3), horizon=30)
+        plan = jax.jit(lambda c, x, b: c(x, b))
+        x0, _ = turning.robot.equilibrium()
+        data = mujoco.MjData(robot.mujoco)
+        data.qpos[:] = x0[:nq]
+        before, states, costs = controller.start(x0), [x0], []
+        for k in range(steps):
+            before = plan(controller, states[-1], before)
+            assert before.plan.status == jm.Status.SOLVED
+            data.ctrl = np.asarray(before.u)
+            costs.append(controller.distance(states[-1], turning.reference(1, k)[0], k))
+            for _ in range(robot.substeps):
+                mujoco.mj_step(robot.mujoco, data)
+            states.append(np.concatenate([data.qpos, data.qvel]))
+        states = np.array(states)
+        heading = np.unwrap(2 * np.arctan2(states[:, 6], states[:, 3]))
+        assert abs((heading[-1] - heading[-45]) / 0.44 - 0.8) < 0.05
+        away = np.abs(states[-1, :2] - turning.reference(steps + 1)[-1, :2])
+        assert away.max() < 0.03 and np.abs(np.array(costs)[100:, :3]).max() < 0.03
+        # Eight periods later the heading has passed half a turn.
+        x = np.asarray(turning.robot.state(turning.states[5])) + np.r_[0.01, np.zeros(36)]
+        one = plan(controller, x, controller.begun(controller.start(x), 5))
+        later = 5 + 10 * P
+        seconds = 10 * P * robot.dt
+        moved = turning.path.state(jnp.asarray(x), nq, jnp.asarray(seconds))
+        other = plan(controller, moved, controller.begun(controller.start(x), later))
+        np.testing.assert_allclose(other.plan.inputs, one.plan.inputs, atol=1e-6)
+        end = turning.path.state(robot.state(one.plan.states[-1]), nq, jnp.asarray(seconds))
+        np.testing.assert_allclose(other.plan.states[-1], robot.coordinates(end), atol=1e-8)
+
+
+@pytest.mark.slow
+def test_limits_of_the_place_are_those_of_the_world(robot, gait):
+    """A straight path, whose coordinates are relative to where it has come."""
+    lower, upper = (np.array(side) for side in gait.robot.state_limits.bounds())
+    upper[0] = 0.1
+    motion = replace(gait, robot=replace(gait.robot, state_limits=jm.Box(lower, upper)))
+    Q = np.repeat([100.0, 200, 400, 200, 100, 20, 1, 0.5, 0.02], [1, 1, 1, 2, 1, 12, 3, 3, 12])
+    with jax.enable_x64(True):
+        controller = GaitController(motion, Q, np.full(12, 1e-3), horizon=8, rho=1e6, margin=0.0)
+        x = np.array(motion.robot.state(motion.reference(1, 19)[0]))  # 9.5 cm on
+        control = jax.jit(lambda c, x, b: c(x, b))(
+            controller, x, controller.begun(controller.start(x), 19)
+        )
+        names = [name for rows in controller.problem(19).soft for name in rows.names]
+    assert control.plan.solved
+    assert motion.reference(9, 19)[-1, 0] > 0.13
+    excess = np.asarray(control.plan.states)[1:, 0] - 0.1
+    slack = np.asarray(control.plan.slack)[1:, names.index(robot.state_names[0])]
+    np.testing.assert_allclose(np.maximum(excess, 0), slack, atol=1e-6)
+    assert excess.max() < 0.02
