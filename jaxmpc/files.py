@@ -9,6 +9,7 @@ import hashlib
 import json
 import math
 import os
+import re
 import tempfile
 import uuid
 import zipfile
@@ -175,13 +176,20 @@ def _require_size(part: zipfile.ZipInfo, member: Any) -> None:
 
 def remove_partial(path: Path) -> None:
     """Remove temporary files of killed processes beside `path`, which must have one writer only."""
-    for left in path.parent.glob(f".{path.name}.*"):
+    for left in side_paths(path):
         left.unlink(missing_ok=True)
 
 
 def side_path(path: Path) -> Path:
     """Return a new name beside a path; what lies there is a leftover once its process has ended."""
     return path.with_name(f".{path.name}.{uuid.uuid4().hex}")
+
+
+def side_paths(path: Path, ending: str = "[0-9a-f]{32}") -> list[Path]:
+    """Return what lies under such names, or under names with another ending, a regular expression;
+    files of the user, .{name}.backup say, do not count."""
+    ours = re.compile(re.escape(f".{path.name}.") + ending)
+    return [left for left in path.parent.glob(".*") if ours.fullmatch(left.name)]
 
 
 @contextlib.contextmanager

@@ -55,7 +55,11 @@ def test_a_failed_write_leaves_the_old_file_alone(tmp_path):
         files.write_arrays(path, {"no JSON": object()})
     assert files.read_arrays(path)[1]["x"].tolist() == [0, 1, 2]
     assert [child.name for child in tmp_path.iterdir()] == ["run.npz"]
-    (tmp_path / ".run.npz.killed").touch()
-    (tmp_path / ".other.npz.killed").touch()
+    files.side_path(path).touch()
+    others = [files.side_path(tmp_path / "other.npz").name, ".run.npz.backup"]
+    for name in others:
+        (tmp_path / name).touch()
     files.remove_partial(path)
-    assert sorted(child.name for child in tmp_path.iterdir()) == [".other.npz.killed", "run.npz"]
+    assert {child.name for child in tmp_path.iterdir()} == {*others, "run.npz"}
+    files.side_path(tmp_path / "s1").touch()
+    assert not files.side_paths(tmp_path / "s[1]")  # no pattern

@@ -16,7 +16,7 @@ import xarray as xr
 import zarr
 from damage import turned_bits
 
-from jaxmpc import store
+from jaxmpc import files, store
 from jaxmpc.feasible.map import BOUNDS
 from jaxmpc.feasible.stored import dimension_names, label_fields, stored_labels
 from jaxmpc.store import BlockWriter, Constant, Store, block_writer
@@ -406,12 +406,18 @@ class TestDamage:
         assert not full.exists()
 
     def test_what_killed_runs_leave(self, full):
-        orphan = full.with_name(".sweep.zarr.123")
+        orphan = files.side_path(full)
         orphan.mkdir()
+        (full.parent / ".sweep.zarr.end.lock").touch()
+        others = [full.with_name(f".sweep.zarr.{name}") for name in ("backup", "my.lock")]
+        others.append(full.with_name(".s1.zarr.keep"))
+        for other in others:
+            other.mkdir()
         partial = full / "label" / "c" / "0" / "0.123.partial"
         partial.touch()
         open_store(full).close()
         assert not orphan.exists() and not partial.exists()
+        assert all(other.exists() for other in others)
 
     def test_one_bit(self, full):
         """Of any file of any array, data or metadata."""

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 import numpy as np
 
 from jaxmpc.checks import entries, fail, whole
-from jaxmpc.files import differences, side_path, versions
+from jaxmpc.files import differences, side_path, side_paths, versions
 from jaxmpc.store.reading import (
     array_of,
     blocks_there,
@@ -423,12 +423,11 @@ class Store:
         written."""
         if not isinstance(self.path, Path):
             return
-        for left in self.path.parent.glob(f".{self.path.name}.*"):
-            if left.is_dir():
-                shutil.rmtree(left, ignore_errors=True)
-            else:
-                with contextlib.suppress(ValueError):  # it is held
-                    Lock(left.parent, file=left.name).release()
+        for left in side_paths(self.path):
+            shutil.rmtree(left, ignore_errors=True)
+        for left in side_paths(self.path, r"(end|\d+-of-\d+)\.lock"):
+            with contextlib.suppress(ValueError):  # it is held
+                Lock(left.parent, file=left.name).release()
         for left in self.path.rglob("*.partial"):
             left.unlink(missing_ok=True)
 

@@ -15,6 +15,7 @@ import numpy as np
 import optax
 import pytest
 
+from jaxmpc.files import side_path
 from jaxmpc.tuning.descent import Settings, descend
 from jaxmpc.tuning.parameters import Parameter, raw, require_parameters, values
 
@@ -207,7 +208,7 @@ def test_checkpoints_that_do_not_fit(tmp_path):
         with pytest.raises(ValueError, match="is no checkpoint"):
             bowl(3, checkpoint=path, decides=DECIDES)
     path.unlink()
-    (tmp_path / ".run.npz.left").write_bytes(b"by a killed process")
+    side_path(tmp_path / "run.npz").write_bytes(b"by a killed process")
     bowl(1, checkpoint=path, decides=DECIDES)
     assert [p.name for p in tmp_path.iterdir()] == ["run.npz"]
 
