@@ -253,6 +253,8 @@ def test_recursion_shows_fates_set_and_counterexample(tmp_path):
     cut = next(line for line in ax.lines if np.allclose(line.get_xdata(), 1.0))
     assert np.ptp(cut.get_ydata()) > 4  # across the picture
     assert ax.get_title(loc="left") == "Closed loops of 9 steps, horizon N = 7"
+    ax = plot_recursion(recursion_report(np.zeros((0, 2))))
+    assert ax.get_xlim()[0] < -0.5 and ax.get_ylim()[0] < -0.5  # all of the set in view
     ax = plot_recursion(report, Figure().add_subplot(), enlarge=True)
     assert not ax.images and ax.get_xlim()[0] > -0.5 and ax.get_xlim()[1] > 1.2
     assert "next state 0.2 outside" in ax.get_title(loc="left")
@@ -477,10 +479,15 @@ def test_a_plan_over_its_horizon():
     q, dq, torque = figure.axes
     np.testing.assert_allclose(q.lines[0].get_ydata(), x[:, 0])
     np.testing.assert_allclose(torque.lines[0].get_ydata(), [1, 2, 2.5, 2.5])
-    upper = {ax: ax.lines[2].get_ydata() for ax in figure.axes}
-    np.testing.assert_allclose(upper[q], [np.nan, np.nan, 0.5, 0.5])
-    np.testing.assert_allclose(upper[dq], [2, 2, 2, np.nan])
-    np.testing.assert_allclose(upper[torque], [2, 2, 2, 2])
+    # Grey regions, and their edges: below, above.
+    upper = {ax: ax.patches[2].get_data() for ax in figure.axes}
+    for ax in figure.axes:
+        np.testing.assert_array_equal(upper[ax].values, ax.patches[3].get_data().values)
+    np.testing.assert_allclose(upper[q].values, [np.nan, np.nan, 0.5, 0.5])
+    np.testing.assert_allclose(upper[q].edges, [0, 0.05, 0.15, 0.25, 0.3])
+    np.testing.assert_allclose(upper[dq].values, [2, 2, 2, np.nan])
+    np.testing.assert_allclose(upper[torque].values, [2, 2, 2])
+    np.testing.assert_allclose(upper[torque].edges, [0, 0.1, 0.2, 0.3])
     np.testing.assert_allclose(dq.lines[1].get_ydata(), [-2, -2, -2, np.nan])
     np.testing.assert_allclose(q.lines[3].get_xdata(), [0.2])
     np.testing.assert_allclose(torque.lines[3].get_xdata(), [0.2, 0.3])

@@ -179,6 +179,7 @@ def plot_robot_map(rmap: RobotMap, ax: Axes | None = None) -> Axes:
     ax = new_axes(9.6) if ax is None else ax
     handles = draw_outcomes(ax, points, _outcomes(rmap))
     linear = rmap.linear
+    ax.autoscale_view()  # before what is drawn next
     ax.autoscale(False)
     handles += draw_bounds(ax, linear, "linear feasible set, ")
     cross: Style = {"marker": "+", "ms": 9, "mew": 1.6, "color": "black"}
@@ -337,8 +338,8 @@ def _draw_losses(ax: Axes, report: RecursionReport) -> list[Artist]:
 
 def _draw_counterexample(ax: Axes, worst: Counterexample) -> list[Artist]:
     """Draw the arrow x → x⁺ and, across the part of the plane in view, the line a'x = b."""
+    (x_low, x_high), (y_low, y_high) = ax.get_xlim(), ax.get_ylim()  # of all that is drawn
     ax.autoscale(False)
-    (x_low, x_high), (y_low, y_high) = ax.get_xlim(), ax.get_ylim()
     a, b = worst.normal, worst.offset
     if abs(a[1]) * (y_high - y_low) > abs(a[0]) * (x_high - x_low):
         x = np.array([x_low, x_high])

@@ -126,12 +126,12 @@ def _draw(
     least, most = (every.min(), every.max()) if len(every) else (0.0, 1.0)
     room = 0.08 * (most - least) or 0.5
     least, most = least - room, most + room
+    # A limit of a state is drawn half a step to each side of its time.
+    edges = time if held else np.concatenate([time[:1], (time[1:] + time[:-1]) / 2, time[-1:]])
     for end, far in ((low, least), (high, most)):
-        there = np.isfinite(end)
-        step: Any = "post" if held else "mid"
-        ax.fill_between(time, end, far, where=there, step=step, color=INFEASIBLE, lw=0, zorder=0)
-        line = np.where(there, end, np.nan)
-        ax.plot(time, line, drawstyle=f"steps-{step}", color=EDGE, lw=0.7, zorder=1)
+        ends = np.where(np.isfinite(end), end, np.nan)[: len(edges) - 1]
+        ax.stairs(ends, edges, baseline=far, fill=True, color=INFEASIBLE, lw=0, zorder=0)
+        ax.stairs(ends, edges, baseline=None, color=EDGE, lw=0.7, zorder=1)
     exceeded = ~rows_kept(Box(low, high), values)
     ax.plot(time[exceeded], values[exceeded], ".", color=BROKEN, ms=5, zorder=4)
     if target is not None:
