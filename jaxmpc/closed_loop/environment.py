@@ -14,7 +14,7 @@ from jaxmpc.closed_loop.robot_controller import robot_mpc
 from jaxmpc.closed_loop.variations import free_motions, start_room
 from jaxmpc.mpc.plan import limited
 from jaxmpc.pytrees import pytree, static
-from jaxmpc.qp.linalg import matmul
+from jaxmpc.qp.linalg import as_floats, matmul
 from jaxmpc.robots.description import host_coordinates
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.robot import Robot
@@ -124,8 +124,7 @@ class Environment:
     def at(self, x: Any) -> EnvironmentState:
         """Return the start of an episode at the state x (nq + nv,)."""
         require_shape("x", x, (self.robot.state_size,), "One state; use jax.vmap for many")
-        x = jnp.asarray(x)
-        x = x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(jnp.zeros(()).dtype)
+        x = as_floats(x)
         return self._state(x, jnp.zeros(()), jnp.asarray(0))
 
     def step(self, state: EnvironmentState, action: Any) -> EnvironmentState:

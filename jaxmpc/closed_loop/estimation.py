@@ -12,6 +12,7 @@ import numpy as np
 import scipy
 from jax import Array
 
+from jaxmpc.arrays import dimensions
 from jaxmpc.checks import (
     concrete,
     fail,
@@ -24,7 +25,7 @@ from jaxmpc.checks import (
 )
 from jaxmpc.mpc.stagewise.nonlinear import NonlinearMPC, linear_model
 from jaxmpc.pytrees import named_pytree, pytree, static
-from jaxmpc.qp.linalg import arrays, matmul, solve, symmetric, symmetric_root
+from jaxmpc.qp.linalg import arrays, as_floats, matmul, solve, symmetric, symmetric_root
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.parameters import FIELDS, NONNEGATIVE, OF_PLANTS, PAYLOAD, require_numbers
 from jaxmpc.robots.robot import Robot, RobotModel
@@ -197,6 +198,7 @@ class KalmanFilter:
 
     ξ_t is estimated from y_0 … y_t (filtered estimate, corrected before the input is computed):
         ξ̂_t|t = ξ̂_t|t−1 + L (y_t − C ξ̂_t|t−1),   ξ̂_t+1|t = f(ξ̂_t|t, u_t).
+    Outputs of which one is NaN or infinite correct nothing: ξ̂_t|t = ξ̂_t|t−1.
     Source: Anderson & Moore 1979, Optimal Filtering, chapters 3, 4 and 8. A pytree.
     """
 
@@ -220,7 +222,7 @@ class KalmanFilter:
         n = self.model.n
         if self.C is None and n % 2 and _robot_model(self.model) is None:
             fail("observer.C", f"is None with {n} states", "Say which outputs are measured")
-        p = self.p if self.C is None or np.ndim(self.C) == 2 else 1
+        p = self.p if self.C is None or dimensions(self.C) == 2 else 1
         if self.C is not None:
             require_shape("observer.C", self.C, (p, n), "One row an output")
             require_finite("observer.C", self.C)
@@ -235,6 +237,7 @@ class KalmanFilter:
         require_spread("observer.initial", self.initial, n)
         if self.start is not None:
             require_shape("observer.start", self.start, (n,), "Coordinates of the first estimate")
+            require_finite("observer.start", self.start)
         names = ("process", "measurement", "C", "initial", "start")
         given: dict[str, Any] = {name: whole_array(getattr(self, name)) for name in names}
         given["disturbance"] = self._prepared_disturbances(p)
@@ -421,10 +424,12 @@ class KalmanFilter:
 
     def outputs(self, xi: Array) -> Array:
         """Return C ξ (p,)."""
+        xi = as_floats(xi)
         return xi[: self.p] if self.C is None else matmul(jnp.asarray(self.C, xi.dtype), xi)
 
     def first(self, xi: Array) -> Belief:
         """Return the estimate before the first output, where the plant starts at ξ; d is 0."""
+        xi = as_floats(xi)
         state = xi if self.start is None else jnp.asarray(self.start, xi.dtype)
         mean = jnp.concatenate([state, jnp.zeros(self.disturbances, xi.dtype)])
         if self.gain is not None:
@@ -435,11 +440,12 @@ class KalmanFilter:
         """Return the estimate after the output y (p,)."""
         mean, P = belief
         C = jnp.asarray(self._outputs_of_all(), mean.dtype)
-        error = y - matmul(C, mean)
+        known, expected = jnp.all(jnp.isfinite(y)), matmul(C, mean)
+        error = jnp.where(known, y, expected) - expected
         if P is None:
             return Belief(mean + matmul(jnp.asarray(self.gain, mean.dtype), error), None)
         V = jnp.asarray(covariance(self.measurement, self.p), mean.dtype)
-        L = _gain(P, C, V)
+        L = jnp.where(known, _gain(P, C, V), 0.0)
         # Joseph's form: a sum of semidefinite terms, whatever the rounding of L.
         left = jnp.eye(len(mean), dtype=mean.dtype) - matmul(L, C)
         P = matmul(left, matmul(P, left.T)) + matmul(L, matmul(V, L.T))

@@ -21,7 +21,7 @@ from jaxmpc.checks import (
     require_shape,
 )
 from jaxmpc.pytrees import prepared_pytree, static
-from jaxmpc.qp.linalg import matmul
+from jaxmpc.qp.linalg import as_floats, matmul
 
 _TEXTS = ("state_names", "input_names", "state_units", "input_units")
 _DELAY = (
@@ -125,7 +125,7 @@ class LinearSystem:
     def step(self, x: Reals, u: Reals) -> jax.Array:
         """Return A x + B u + c for x (n,) and u (m,), computed in the dtype of x; of a system that
         differs from step to step the first step."""
-        x = jnp.asarray(x)
+        x = as_floats(x)
         parts = (self.A, 2), (self.B, 2), (0.0 if self.c is None else self.c, 1)
         every = ((jnp.asarray(v, x.dtype), axes) for v, axes in parts)
         A, B, c = (v[0] if v.ndim > axes else v for v, axes in every)

@@ -523,6 +523,27 @@ def test_not_finite_stays_in_its_row(gaussian):
     np.testing.assert_allclose(found[jnp.array([0, 2])], clean[jnp.array([0, 2])])
 
 
+@pytest.mark.parametrize("initial", [None, 0.3])
+def test_outputs_that_are_not_finite_correct_nothing(initial):
+    """One bad reading: the estimate is the prediction, and the loop goes on."""
+    observer = KalmanFilter(SYSTEM, W.tolist(), [0.03], C=[[1.0, 0.0]], initial=initial)
+    bad = np.zeros((6, 1))
+    bad[2] = np.inf
+    run = lambda **more: jm.simulate(
+        jm.Controller(MPC), SYSTEM, [0.3, 0.1], 6, observer=observer, **more
+    )
+    found = run(output_disturbance=bad)
+    assert np.all(found.status == jm.Status.SOLVED)
+    x, u = found.estimates[1], found.inputs[1]
+    np.testing.assert_allclose(found.estimates[2], SYSTEM.step(x, u), atol=1e-12)
+    belief = observer.prepared().first(np.array([3, 2]))  # whole numbers too
+    assert initial is None or np.all(np.diag(belief.covariance) > 0)
+    np.testing.assert_allclose(observer.outputs([3, 2]), [3.0])
+    slope = jax.grad(lambda x: jnp.sum(observer.prepared().corrected(
+        observer.prepared().first(x), jnp.array([jnp.nan])).mean))  # fmt: skip
+    np.testing.assert_allclose(slope(jnp.array([0.3, 0.1])), 1.0)
+
+
 @pytest.mark.slow
 def test_orientations_stay_rotations():
     """Noise on a quadrotor lives in the coordinates: quaternions of length 1, the noise in ξ."""
@@ -573,6 +594,14 @@ def test_bad_noise_and_observers_are_named():
         (lambda: run(observer=KalmanFilter(SYSTEM, None, 1.0)), "observer.process: is None"),
         (lambda: run(observer=KalmanFilter(SYSTEM, 1.0, 1.0, C=np.eye(3))), "observer.C: shape"),
         (lambda: run(observer=KalmanFilter(SYSTEM, 1.0, 1.0, start=[0.0])), "observer.start: sha"),
+        (
+            lambda: run(observer=KalmanFilter(SYSTEM, 1.0, 1.0, start=[np.nan, 0.0])),
+            "observer.start: holds NaN",
+        ),
+        (
+            lambda: run(observer=KalmanFilter(SYSTEM, 1.0, 1.0, C=[[1.0], [1.0, 2.0]])),
+            "observer.C: .* is not an array",
+        ),
         (
             lambda: run(observer=KalmanFilter(SYSTEM, 1.0, 1.0, C=[[0.0, 1.0]])),
             "observer.C: no output shows the mode with eigenvalue 1",

@@ -159,3 +159,11 @@ def test_a_delay_of_the_input_is_no_keyword_and_its_cure_is_exact():
     between = first.A @ x + first.B @ before  # the old input for the delay, then the new one
     after = system.A @ np.append(x, before) + system.B @ u
     assert after == pytest.approx(np.append(rest.A @ between + rest.B @ u, u), abs=1e-15)
+
+
+def test_whole_numbers_are_numbers():
+    """Not the type in which the step is computed."""
+    system = LinearSystem([[1.0, 0.1], [0.0, 0.9]], [[0.005], [0.1]], [0.25, 0.25])
+    expected = [3.4525, 2.1]
+    for x in ([3, 2], np.array([3, 2]), np.array([3, 2], np.int8)):
+        np.testing.assert_allclose(system.step(x, [0.5]), expected, rtol=1e-6)
