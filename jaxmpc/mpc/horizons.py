@@ -6,7 +6,7 @@ the terminal set, which are those of x_M now, are asked of the same state; the f
 the costs and limits that they had; and the inputs from step N on move nothing and cost u'Ru, which
 is least for u = 0. Minimisers and multipliers of the first N steps are the same, the least cost
 is, and so are the states from which there is a plan. (Where moves are blocked the added inputs are
-those of the last block, and cost nothing.)
+those of the last block, and cost nothing.) A constant forecast is one of the first N steps.
 """
 
 from collections.abc import Sequence

@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.arrays import Reals, as_array, host_array
-from jaxmpc.checks import fail, require_finite, require_kind, require_shape
+from jaxmpc.checks import concrete, fail, require_finite, require_kind, require_shape
 from jaxmpc.mpc.problem import MPC, at_stage, weights_of
 from jaxmpc.mpc.rows import Block, Layout, blocks, given_blocks, layout, row_count, row_table, split
 from jaxmpc.pytrees import named_pytree, pytree
@@ -78,13 +78,26 @@ def checked_aim(
     def checked(name: str, value: Reals | None, shapes: Sequence[tuple[int, ...]]) -> Any:
         return None if value is None else checked_array(name, value, shapes)
 
+    known = checked("forecast", forecast, shapes["forecast"])
     return Aim(
         checked_array("x0", x0, [(size,)]),
         checked("reference", reference, shapes["reference"]),
         checked("input_reference", input_reference, shapes["input_reference"]),
         checked("previous_input", previous_input, [(mpc.system.m,)]),
-        checked("forecast", forecast, shapes["forecast"]),
+        known if steps > 1 else _where_steps_do_something(mpc, known),
     )
+
+
+def _where_steps_do_something(mpc: MPC, forecast: Any) -> Any:
+    """Return a forecast; a constant one (n,) of a problem with steps that do nothing, those that
+    `pad_horizon` adds, as rows (N, n) that are zero there."""
+    A, B, Q = (as_array(v) for v in (mpc.system.A, mpc.system.B, mpc.Q))
+    if forecast is None or np.ndim(forecast) > 1 or min(v.ndim for v in (A, B, Q)) < 3:
+        return forecast
+    xp = np if concrete(A, B, Q, forecast) else jnp
+    still = xp.all(A == np.eye(A.shape[-1]), axis=(1, 2))
+    idle = still & ~xp.any(B, axis=(1, 2)) & ~xp.any(Q, axis=(1, 2))
+    return xp.where(idle[:, None], xp.zeros_like(forecast), forecast)
 
 
 def reference_shapes(

@@ -115,3 +115,21 @@ def test_policies_of_unbounded_sets_have_no_map(policy, states):
         jm.map_feasible_set(mpc, np.zeros((2, 2)))
     plain = replace(mpc, policy="tightened")  # the cure
     assert jm.map_feasible_set(plain, np.zeros((2, 2))).label.tolist() == [1, 1]
+
+
+def test_constant_forecasts_are_of_the_steps_of_the_problem():
+    """Not of those that are added, also where nothing can be read."""
+    mpc = problem(3, outputs=(), soft=())
+    x, push = X0[0], np.array([0.03, -0.02])
+    alone = jm.solve(mpc, x, forecast=push, previous_input=[0.2])
+    padded = pad_horizon(mpc, 5)
+    traced = jax.jit(lambda p, w: jm.solve(p, x, forecast=w, previous_input=[0.2]))
+    rows = np.vstack([np.tile(push, (3, 1)), np.zeros((2, 2))])
+    for plan in (
+        jm.solve(padded, x, forecast=push, previous_input=[0.2]),
+        traced(padded, push),
+        traced(padded, rows),
+    ):
+        assert plan.solved
+        np.testing.assert_allclose(plan.cost, alone.cost, rtol=1e-9)
+        np.testing.assert_allclose(plan.inputs[:3], alone.inputs, atol=1e-7)
