@@ -6,7 +6,8 @@ A_K^s E W ⊆ α E W with α < 1, F = (1 − α)⁻¹ ⊕_{i<s} A_K^i E W is inv
     F∞ ⊆ F ⊆ (1 − α)⁻¹ F∞        (Raković, Kerrigan, Kouramas & Mayne 2005, IEEE TAC 50).
 
 There is no such α where E W is flat or has the origin on its boundary. Then the same is done for
-E W ⊕ D with a small box D = {|x| ≤ spread}: F is invariant for it, hence for E W.
+E W ⊕ D with a small box D = {|x| ≤ spread}: F is invariant for it, hence for E W. D is flat along
+the coordinates that neither E W nor the rest of D moves.
 """
 
 from fractions import Fraction
@@ -42,8 +43,9 @@ class MinimalInvariantSet(ConvexSet):
     invariant set and is robust invariant itself.
 
     closed (n, n): A + BK. E (n, p), disturbance: W. spread (n,): zero where E W has volume around
-    the origin. alpha: with closed^steps (E W ⊕ …) ⊆ alpha (E W ⊕ …). normals (k, n): the directions
-    in which that was compared, which show it. excess: along a coordinate, up or down, F reaches at
+    the origin, and along coordinates that nothing moves. alpha: with closed^steps (E W ⊕ …) ⊆
+    alpha (E W ⊕ …). normals (k, n): the directions in which that was compared, which show it, with
+    coordinates that nothing moves. excess: along a coordinate, up or down, F reaches at
     most 1 + excess times as far as the minimal set, where that reaches anywhere. exact_alpha: an
     upper bound of the least such alpha in rational arithmetic, with W a Box; else None.
 
@@ -160,17 +162,32 @@ def minimal_robust_invariant_set(
     reach = np.maximum(extent[:n], extent[n:])
     if not reach.any():  # W = {0}
         return _found(closed, E, W, spread, np.eye(n), 0.0, 1, 0.0)
-    size = np.where(reach > 0, reach, reach.max())
+    size = _spread_with(closed, E, W, reach, count)
+    normals = np.eye(n)[size > 0]
     alpha, steps, excess = 0.0, 0, np.inf
     for halvings in range(_HALVINGS):
         spread = eps / 4 * 0.5**halvings * size
-        alpha, steps = _contraction(closed, E, W, spread, np.eye(n), eps / 3, max_steps, radius)
+        alpha, steps = _contraction(closed, E, W, spread, normals, eps / 3, max_steps, radius)
         whole_ = sum_of_supports(closed, E, W, spread, steps, identity)
         moved = extent > 0
         excess = float((whole_[moved] / extent[moved]).max() / (1 - alpha) - 1)
         if excess <= eps:
             break
-    return _found(closed, E, W, spread, np.eye(n), alpha, steps, excess)
+    return _found(closed, E, W, spread, normals, alpha, steps, excess)
+
+
+def _spread_with(
+    closed: np.ndarray, E: np.ndarray, W: Any, size: np.ndarray, steps: int
+) -> np.ndarray:
+    """Return how far E W with a box of these sides (n,) moves each coordinate that neither does
+    alone, beside `size` where that is not 0: in the unit of each, and 0 where nothing moves it."""
+    identity = np.vstack([np.eye(len(size)), -np.eye(len(size))])
+    while True:
+        ends = sum_of_supports(closed, E, W, size, steps, identity)
+        further = np.where(size > 0, size, np.maximum(*np.split(ends, 2)))
+        if np.array_equal(further > 0, size > 0):
+            return size
+        size = further
 
 
 def sum_of_disturbances(
@@ -280,11 +297,14 @@ def _found(
     excess: float,
 ) -> MinimalInvariantSet:
     """Return the set, with its α in rational arithmetic where that is little work."""
-    n = len(closed)
-    exact = None
-    plain = isinstance(W, Box) and np.array_equal(np.abs(normals[:n]), np.eye(n))
-    if plain and alpha > 0 and steps**2 * n**3 <= _EXACT:
-        exact = _exact_alpha(closed, E, W, spread, steps)
+    exact, moved = None, np.any(normals, axis=0)
+    count = int(moved.sum())
+    plain = isinstance(W, Box) and np.array_equal(
+        np.abs(normals[:count]), np.eye(len(closed))[moved]
+    )
+    if plain and alpha > 0 and steps**2 * count**3 <= _EXACT:
+        part = closed[np.ix_(moved, moved)], E[moved]
+        exact = _exact_alpha(*part, W, spread[moved], steps)
     return MinimalInvariantSet(closed, E, W, spread, alpha, steps, excess, normals, exact)
 
 

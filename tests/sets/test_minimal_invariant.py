@@ -134,3 +134,31 @@ def test_maximal_sets_take_the_matrix_of_disturbances():
     last = jm.maximal_invariant_set(DOUBLE, K, X, U, disturbance=W, disturbance_matrix=E)
     report = jm.sets.verify_terminal(DOUBLE, np.eye(2), 0.1, None, last, X, U, K, W, E)
     assert report["invariance under K"].holds and report.exact_factor is not None
+
+
+FLAT = {
+    # x2 is moved by nothing; x3 only where x1 and x2 differ, which disturbances do not make.
+    "exogenous": ([[0.5, 0.2], [0.0, 0.9]], [1.0, 0.0]),
+    "cancelling": ([[0.5, 0, 0], [0, 0.5, 0], [0.3, -0.3, 0.4]], [1.0, 1.0, 0.0]),
+}
+
+
+@pytest.mark.parametrize("name", FLAT)
+@pytest.mark.parametrize("unit", [1e3, 1.0, 1e-3, 1e-6])
+def test_units_of_what_disturbances_do_not_move(name, unit):
+    """Decide nothing: the set has no extent there but for what makes it invariant."""
+    A, e = (np.array(v) for v in FLAT[name])
+    n = len(A)
+    scale = np.append(np.ones(n - 1), unit)
+    system = jm.LinearSystem(A * scale[:, None] / scale, np.zeros((n, 1)))
+    found = minimal_robust_invariant_set(
+        system, np.zeros((1, n)), jm.Box(-1.0, 1.0), disturbance_matrix=e * scale
+    )
+    assert found.excess <= 1e-3
+    last = found.bounding_box().upper[-1] / unit
+    assert last == 0 if name == "exogenous" else 0 < last < 5e-3
+    normals = np.vstack([np.eye(n), -np.eye(n), np.random.default_rng(0).normal(size=(50, n))])
+    normals = normals / scale
+    after = found.supports(normals @ np.asarray(system.A)) + np.abs(normals @ (e * scale))
+    assert np.all(after <= found.supports(normals) * (1 + 1e-9) + 1e-12)
+    assert found.exact_alpha is not None and found.exact_alpha <= found.alpha
