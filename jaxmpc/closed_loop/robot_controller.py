@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxmpc.arrays import Reals, as_weight, host_array
-from jaxmpc.checks import concrete, fail, number, require_untraced, whole
+from jaxmpc.arrays import Reals, as_array, as_weight
+from jaxmpc.checks import concrete, fail, number, whole
 from jaxmpc.closed_loop.feedback import one_state
 from jaxmpc.closed_loop.nonlinear_controller import (
     at_rest,
@@ -31,11 +31,16 @@ from jaxmpc.mpc.stagewise.nonlinear import NonlinearMPC, Task
 from jaxmpc.mpc.stagewise.solve import factor_stages, solve_stagewise
 from jaxmpc.pytrees import prepared_pytree, static
 from jaxmpc.qp.admm import ADMM, DEFAULT
-from jaxmpc.qp.linalg import arrays, floating_dtype
+from jaxmpc.qp.linalg import arrays, floating_dtype, matmul
 from jaxmpc.robots.contacts import friction_cones, stands
 from jaxmpc.robots.description import host_coordinates
 from jaxmpc.robots.equilibria import settled
-from jaxmpc.robots.force_limits import ForceLimits, force_limits, stopping_limits
+from jaxmpc.robots.force_limits import (
+    ForceLimits,
+    StoppingLimits,
+    force_limits,
+    stopping_limits,
+)
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.robot import Robot, RobotModel
 from jaxmpc.sets.convex_sets import Box
@@ -108,7 +113,7 @@ def robot_mpc(
         if terminal_cost != "lqr":
             fail("terminal_cost", f"{terminal_cost!r}", 'Give "lqr", a matrix or None')
         named = () if stands(robot) else names  # feet that stand are not moved, as they shall
-        terminal_cost = _terminal_cost(system, Q, R, named) if rests else None
+        terminal_cost = lqr_cost(system, Q, R, named) if rests else None
     usual = {"constrained_stages": tuple(range(1, horizon + 1)), "terminal_cost": terminal_cost}
     mpc = replace(mpc, **{**usual, **fields})
     if isinstance(robot, Robot):
@@ -135,6 +140,21 @@ def _limits_of_forces(
     stopping = stopping_limits(robot, x[: robot.mujoco.nq], states)
     if stopping is not None:
         yield replace(stopping, stages=(0, horizon))
+
+
+def tightened(robot: Robot | LinearPlant, mpc: MPC, x: np.ndarray, margin: Any) -> MPC:
+    """Return the problem of a robot that rests at x with its state limits tightened by another
+    fraction, which may be traced, and with rows that stop its joints within these."""
+    states = robot.state_limits.tightened(margin)
+
+    def within(rows: Outputs) -> Outputs:
+        if not isinstance(robot, Robot) or not isinstance(rows, StoppingLimits):
+            return rows
+        found = stopping_limits(robot, x[: robot.mujoco.nq], states)
+        return rows if found is None else replace(found, stages=rows.stages)
+
+    outputs = tuple(map(within, as_tuple("outputs", mpc.outputs, Outputs)))
+    return replace(mpc, states=states, outputs=outputs)
 
 
 def bryson_weights(
@@ -171,23 +191,19 @@ def _around(limits: Box, margin: float, point: np.ndarray, names: tuple[str, ...
     return Box(low, high)
 
 
-def _terminal_cost(system: LinearSystem, Q: Reals, R: Reals, names: tuple[str, ...]) -> Reals:
+def lqr_cost(system: LinearSystem, Q: Reals, R: Reals, names: tuple[str, ...] = ()) -> Reals:
     """Return P of the LQR; where inputs do not move all modes that last, P = T P_r T' with P_r of
     the LQR on the subspace that they reach, T (n, r) an orthonormal basis of it.
 
     The reached part T'x follows T'AT and T'B, driven by the rest as by a disturbance, which P
-    leaves out: no input changes that rest.
+    leaves out: no input changes that rest. names: of the states, for a warning where there is such
+    a rest; none is given without them. Q and R may be traced.
     """
     A, B, _ = host_matrices(system)
     if least_reached(A, B)[0] > UNREACHED:
         return lqr(system, Q, R).P
-    cure = 'Give terminal_cost=None or a matrix: inputs do not move all states, and "lqr" reads it'
-    for name, weight in (("Q", Q), ("R", R)):
-        require_untraced(name, weight, cure)
-    q, r = host_array("Q", Q), host_array("R", R)
-    units = natural_units(A, B, q, r)
+    units = natural_units(A, B)
     A, B = units.system(A, B)
-    q, r = units.weights(q, r)
     T = reached_subspace(A, B)
     if names:
         unmoved = np.flatnonzero(np.linalg.norm(T, axis=1) < 0.999)
@@ -196,8 +212,10 @@ def _terminal_cost(system: LinearSystem, Q: Reals, R: Reals, names: tuple[str, .
             "there is stabilizable); it is the LQR's of what they move",
             stacklevel=3,
         )
-    reduced = LinearSystem(T.T @ A @ T, T.T @ B)
-    return units.cost_matrix(T @ np.asarray(lqr(reduced, T.T @ q @ T, r).P) @ T.T)
+    q, r = units.weights(as_array(Q), as_array(R))
+    inside: Any = T
+    P: Any = lqr(LinearSystem(T.T @ A @ T, T.T @ B), matmul(inside.T, matmul(q, inside)), r).P
+    return units.cost_matrix(matmul(inside, matmul(P, inside.T)))
 
 
 def reached_subspace(A: np.ndarray, B: np.ndarray) -> np.ndarray:

@@ -21,8 +21,10 @@ middle of the period would leave out the largest forces that the plant has.
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
+from jaxmpc.checks import concrete
 from jaxmpc.mpc.problem import Outputs
 from jaxmpc.pytrees import pytree
 from jaxmpc.robots.description import RobotDescription, host_coordinates
@@ -40,6 +42,11 @@ DISTANCES = np.array([0.0, 1 / 64, 1 / 16, 1 / 4, 1.0])
 @pytree
 class ForceLimits(Outputs):
     """Limits of forces that the plant keeps whatever the input, by cutting the forces off."""
+
+
+@pytree
+class StoppingLimits(Outputs):
+    """Rows of states from which limited forces stop joints, see `stopping_limits`."""
 
 
 def force_limits(robot: RobotDescription, x: Any, u: Any) -> ForceLimits | None:
@@ -104,14 +111,15 @@ def force_limits(robot: RobotDescription, x: Any, u: Any) -> ForceLimits | None:
     )
 
 
-def stopping_limits(robot: RobotDescription, q: Any, positions: Box) -> Outputs | None:
+def stopping_limits(robot: RobotDescription, q: Any, positions: Box) -> StoppingLimits | None:
     """Return the rows of states from which limited forces stop each joint within its positions.
 
     Of a joint at q_i with the speed v > 0, all of whose actuators have limits of their forces,
     v ≤ √(2 a (upper − q_i)), and likewise below. a: what the limits leave at the configuration q
     (nq,) at rest beside gravity and springs, over the joint's own inertia: other joints stand
     still. The parabola, a convex set, is replaced by chords (`DISTANCES`), up to 6 % inside.
-    positions: Box of the coordinates (n,). None where there is no such joint.
+    positions: Box of the coordinates (n,), bounded where `state_limits` are. None where there is
+    no such joint.
     """
     model, smooth = robot.mujoco, robot.predictor.model
     data = mujoco.MjData(smooth)
@@ -129,11 +137,16 @@ def stopping_limits(robot: RobotDescription, q: Any, positions: Box) -> Outputs 
         ends[pulls, 0] = np.maximum(ends[pulls, 0], share[0])
         ends[pulls, 1] = np.minimum(ends[pulls, 1], share[1])
     lower, upper = positions.bounds()
-    rows = list[tuple[np.ndarray, float, str]]()
+    xp = np if concrete(positions) else jnp
+    bounded = np.isfinite(np.subtract(*robot.state_limits.bounds()))
+    # v ≤ √(2 a d) at the distances d = D w, w the width of the range: chords of the slopes k/√w.
+    speeds = np.sqrt(2 * DISTANCES)
+    slopes = np.diff(speeds) / np.diff(DISTANCES)
+    rows = list[tuple[Any, Any, str]]()
     for joint in np.flatnonzero(single_joints(model)):
         i = model.jnt_dofadr[joint]
         pulls = moment[:, i] != 0
-        if not pulls.any() or not np.isfinite(upper[i] - lower[i]):
+        if not pulls.any() or not bounded[i]:
             continue
         force = np.sort(moment[pulls, i, None] * ends[pulls], axis=1).sum(axis=0)
         if model.jnt_actfrclimited[joint]:
@@ -143,19 +156,16 @@ def stopping_limits(robot: RobotDescription, q: Any, positions: Box) -> Outputs 
         for sign, end, stop in ((1.0, upper[i], -slower), (-1.0, -lower[i], faster)):
             if not (0 < stop < np.inf):
                 continue
-            distances = DISTANCES * (upper[i] - lower[i])
-            speeds = np.sqrt(2 * stop * distances)
-            slopes = np.diff(speeds) / np.diff(distances)
-            for slope, distance, speed in zip(slopes, distances, speeds, strict=False):
+            width, name = upper[i] - lower[i], name_of(model, "joint", joint)
+            for slope, distance, speed in zip(slopes, DISTANCES, speeds, strict=False):
                 # v − speed ≤ slope (end ∓ q − distance), in the unit of the position.
-                row = np.zeros(robot.n)
-                row[i], row[smooth.nv + i] = sign, sign / slope
-                bound = end - distance + speed / slope
-                rows.append((row, bound, f"stopping of {name_of(model, 'joint', joint)}"))
+                time = xp.sqrt(width / stop) / slope
+                row = sign * (np.eye(robot.n)[i] + time * np.eye(robot.n)[smooth.nv + i])
+                rows.append((row, end + width * (speed / slope - distance), f"stopping of {name}"))
     if not rows:
         return None
     C, above, names = zip(*rows, strict=True)
-    return Outputs(np.array(C), upper=np.array(above), names=names)
+    return StoppingLimits(xp.stack(C), upper=xp.stack(above), names=names)
 
 
 def _of_tendons(model: "mujoco.MjModel") -> np.ndarray:

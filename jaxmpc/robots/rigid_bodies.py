@@ -272,6 +272,7 @@ def bodies(tree: Tree, model: Mapping[str, Any], q: Array) -> Bodies:
     R, anchor, pivot = matrix(quaternion), p[tree.link], model["jnt_pos"]
     axis = rotated(r[tree.link], model["jnt_axis"])
     if not _is_zero(pivot):
+        pivot = pivot * (tree.kinds != FREE)[:, None, None]  # a free joint has none
         anchor = anchor + rotated(r[tree.link], pivot)
     middle = position + rotated(quaternion, model["body_ipos"])
     principal = matrix(product(quaternion, jnp.asarray(model["body_iquat"])))

@@ -17,7 +17,12 @@ import numpy as np
 from jaxmpc.arrays import Reals, numpy_array
 from jaxmpc.checks import fail, generator, require_finite, require_memory
 from jaxmpc.closed_loop.outcome import evaluate_runs
-from jaxmpc.closed_loop.robot_controller import RobotController, robot_references
+from jaxmpc.closed_loop.robot_controller import (
+    RobotController,
+    lqr_cost,
+    robot_references,
+    tightened,
+)
 from jaxmpc.closed_loop.simulation import Run, simulate_many
 from jaxmpc.closed_loop.variations import plant_numbers
 from jaxmpc.feasible.problem import FeasibilityProblem
@@ -33,7 +38,6 @@ from jaxmpc.robots.robot import Robot
 from jaxmpc.sets.convex_sets import Box, Polytope
 from jaxmpc.sets.limits import TOLERANCE, rows_kept
 from jaxmpc.sets.lp import Program
-from jaxmpc.systems.riccati import lqr
 from jaxmpc.tuning.losses import TERMS, ClosedLoopLoss
 from jaxmpc.tuning.parameters import Parameter, is_diagonal
 from jaxmpc.tuning.result import TuningRun
@@ -278,6 +282,10 @@ def robot_task(
     the nominal model. linearize, rho, solver: of `RobotController`. The rest as in `linear_task`.
     """
     reference, input_reference = robot_references(robot, target)
+    with jax.enable_x64(True):
+        x = np.asarray(robot.state(reference))
+    if mpc.terminal_cost is None:  # no LQR: the set-point does not rest
+        terminal_weight = "given"
     loss = weight_loss(mpc.Q, mpc.R, robot.state_limits, reference, input_reference, robot, **terms)
     variations = plant_numbers(robot, dict(factors or {}))
     require_numbers(robot.plant, variations, (len(np.asarray(x0s)),))
@@ -285,8 +293,7 @@ def robot_task(
     def make(values: Values) -> RobotController:
         made = _weighted(mpc, values, terminal_weight)
         if "tightening" in values:
-            states = robot.state_limits.tightened(values["tightening"])
-            made = dataclasses.replace(made, states=states)
+            made = tightened(robot, made, x, values["tightening"])
         return RobotController(robot, made, solver, linearize=linearize, rho=values.get("rho", rho))
 
     return WeightTask(
@@ -356,7 +363,7 @@ def _weighted(mpc: MPC, values: Values, terminal_weight: str) -> MPC:
     mpc = dataclasses.replace(mpc, Q=values.get("Q", mpc.Q), R=values.get("R", mpc.R))
     P = values.get("P", mpc.Q if terminal_weight == "Q" else mpc.terminal_cost)
     if terminal_weight == "lqr" and "P" not in values and {"Q", "R"} & set(values):
-        P = lqr(mpc.system, mpc.Q, mpc.R).P
+        P = lqr_cost(mpc.system, mpc.Q, mpc.R)
     return dataclasses.replace(mpc, terminal_cost=P)
 
 
