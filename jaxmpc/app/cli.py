@@ -159,7 +159,11 @@ def run(options: Any, argv: Sequence[str]) -> Outcome:
     except BrokenPipeError:
         return Outcome(without_reader())
     except (ValueError, OSError, MemoryError, ImportError) as error:
-        return Outcome(report_error(named_options(str(error), options)))
+        message = str(error)
+        if isinstance(error, OSError) and error.filename is None and error.strerror:
+            resuming = ", and go on with --resume" if options.keeps else ""
+            message = f"writing: {error.strerror}. Make room where it is written to{resuming}"
+        return Outcome(report_error(named_options(message, options)))
     except KeyboardInterrupt:
         if not options.keeps:
             print("\nstopped; nothing is kept")

@@ -113,7 +113,11 @@ def robot_mpc(
         if terminal_cost != "lqr":
             fail("terminal_cost", f"{terminal_cost!r}", 'Give "lqr", a matrix or None')
         named = () if stands(robot) else names  # feet that stand are not moved, as they shall
-        terminal_cost = lqr_cost(system, Q, R, named) if rests else None
+        try:
+            terminal_cost = lqr_cost(system, Q, R, named) if rests else None
+        except ValueError as error:
+            cure = "Or give terminal_cost=None, or a matrix"
+            fail("terminal_cost", f"'lqr', and the set-point has none ({error})", cure)
     usual = {"constrained_stages": tuple(range(1, horizon + 1)), "terminal_cost": terminal_cost}
     mpc = replace(mpc, **{**usual, **fields})
     if isinstance(robot, Robot):

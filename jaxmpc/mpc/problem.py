@@ -296,6 +296,9 @@ class MPC:
         store_floats(self, *weights, "prestabilise", "input_rate_limit")
         store_floats(self, "disturbance_matrix", "gain")
         store_stages(self, "constrained_stages")
+        for name in ("outputs", "soft"):
+            if isinstance(getattr(self, name), list):
+                object.__setattr__(self, name, tuple(getattr(self, name)))
         if isinstance(self.control_horizon, np.ndarray) and not self.control_horizon.ndim:
             object.__setattr__(self, "control_horizon", self.control_horizon.item())
         if isinstance(self.control_horizon, list | range | np.ndarray):

@@ -136,8 +136,8 @@ def stopping_limits(robot: RobotDescription, q: Any, positions: Box) -> Stopping
         share = model.tendon_actfrcrange[tendon] / pulls.sum()
         ends[pulls, 0] = np.maximum(ends[pulls, 0], share[0])
         ends[pulls, 1] = np.minimum(ends[pulls, 1], share[1])
-    lower, upper = positions.bounds()
     xp = np if concrete(positions) else jnp
+    lower, upper = (xp.asarray(side) for side in (positions.lower, positions.upper))
     bounded = np.isfinite(np.subtract(*robot.state_limits.bounds()))
     # v ≤ √(2 a d) at the distances d = D w, w the width of the range: chords of the slopes k/√w.
     speeds = np.sqrt(2 * DISTANCES)

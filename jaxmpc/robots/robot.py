@@ -246,9 +246,12 @@ class Robot(RobotDescription):
 
         They are of the predictor, in continuous time. Computed outside JAX in float64 by MuJoCo's C
         engine. Raises ValueError where no input does, as for a model whose actuators
-        have activation states.
+        have activation states, and for robots on feet.
         """
         nv = self.mujoco.nv
+        if hasattr(self.predictor, "feet"):
+            cure = "At rest `equilibrium` knows them"
+            fail("robot", "stands on feet, whose forces inverse dynamics do not know", cure)
         if self.mujoco.na:
             cure = "Inverse dynamics need actuators with dyntype none"
             fail("robot", "has activation states between inputs and forces", cure)

@@ -545,7 +545,8 @@ def test_a_full_disk_is_one_line_and_resume_goes_on(tmp_path, capsys):
         found = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
         assert found.returncode == 2 and found.stderr.count("\n") <= 2
         assert found.stderr.splitlines()[-1] == (
-            "jaxmpc: error: [Errno 28] No space left on device"
+            "jaxmpc: error: writing: No space left on device. Make room where it is written to, "
+            "and go on with --resume"
         )
     assert run(f"{line} --resume") == 0
     assert run("verify jaxmpc-sweep") == 0

@@ -284,6 +284,10 @@ def test_the_precision_of_a_program_is_that_of_theta():
         double = jax.jit(lambda theta: parameter.at(theta))(parameter.raw())
     assert single.dtype == np.float32 and double.dtype == np.float64
     np.testing.assert_allclose([single, double], 0.02, rtol=1e-6)
+    # Whole numbers, as JSON has them, decide no precision.
+    np.testing.assert_allclose(parameter.at([0]), parameter.at([0.0]), rtol=1e-6)
+    held = Parameter([0.2, 0.9], train=[True, False])
+    np.testing.assert_allclose(held.at([1]), [1.0, 0.9], rtol=1e-6)
 
 
 def test_masks_hold_entries():

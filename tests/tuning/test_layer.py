@@ -34,6 +34,8 @@ def test_rows_that_soften_made_have_names():
             soft = layer.problem(theta).soft
             changed = [np.any(s.rho != one.soft[0].rho) for s in soft]
             assert changed == [k == i or len(soft) == 1 for k in range(len(soft))]
+    listed = jm.tuning.MPCLayer(replace(one, soft=list(one.soft)), learn=("soft.rho",))
+    assert tuple(listed.parameters) == ("soft.rho",)
     with pytest.raises(ValueError, match="'soft.rho' is no field"):
         jm.tuning.MPCLayer(two, learn=("soft.rho",))
     with pytest.raises(ValueError, match="'soft.2.rho' is no field"):

@@ -4,14 +4,17 @@ import json
 import warnings
 from dataclasses import replace
 
+import jax
+import mujoco
 import numpy as np
 import problems
 import pytest
 
 import jaxmpc as jm
 from jaxmpc.closed_loop.simulation import Run
+from jaxmpc.tuning.parameters import Parameter
 from jaxmpc.tuning.result import CHECKPOINT, run_folder
-from jaxmpc.tuning.tasks import TIGHTEST, initial_range, weight_loss
+from jaxmpc.tuning.tasks import TIGHTEST, initial_range, robot_task, weight_loss
 
 SYSTEM = replace(problems.double_integrator(4).system, dt=1.0)
 MPC = replace(problems.double_integrator(4), system=SYSTEM, terminal_cost=np.eye(2))
@@ -116,3 +119,43 @@ def test_terms_of_a_loss_add_up_and_warn_of_nothing():
         terms = task.terms(run)
     assert list(terms) == ["tracking", "effort", "violation", "settling"]
     np.testing.assert_allclose(list(terms.values()), [1.0, 0.1, 10 * 0.25, 0.0], atol=1e-3)
+
+
+SERVOS = """<mujoco><option timestep=".005" integrator="implicitfast"/><worldbody>
+<body><joint name="a" axis="0 1 0" range="-1 1" damping=".1" armature=".05"/>
+<geom type="capsule" fromto="0 0 0 0 0 -.3" size=".03" mass="1"/></body></worldbody>
+<actuator><position joint="a" kp="60" kv="3" ctrlrange="-1 1" forcerange="-8 8"/></actuator>
+</mujoco>"""
+# A lift too weak for its load, and one beside an object that no input moves.
+WEAK = """<mujoco><worldbody><body><joint name="a" type="slide" axis="0 0 1" range="-1 1"/>
+<geom size=".1" mass="1"/></body></worldbody>
+<actuator><motor joint="a" ctrlrange="-5 5"/></actuator></mujoco>"""
+BESIDE = WEAK.replace(
+    "<worldbody>",
+    """<option gravity="0 0 0"/><worldbody><body pos="0 1 0">
+<joint name="object" type="slide" damping=".5"/><geom size=".1" mass="1"/></body>""",
+)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("text", [SERVOS, WEAK, BESIDE])
+def test_the_tuned_robot_has_the_problem_of_its_file(text):
+    """Of `robot_mpc` with the tuned weights and margin: terminal cost and rows that stop joints."""
+    robot = jm.load_robot(mujoco.MjModel.from_xml_string(text), velocity=2.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of the set-points
+        mpc = jm.robot_mpc(robot, horizon=4)
+        parameters = {"Q": Parameter(mpc.Q, "diagonal"), "tightening": Parameter(0.02)}
+        task = robot_task(robot, mpc, parameters, np.tile(robot.home, (4, 1)))
+        Q = mpc.Q * np.linspace(1, 3, robot.n)
+        expected = jm.robot_mpc(robot, Q, mpc.R, horizon=4, margin=0.3)
+        found = task.make({"Q": Q, "tightening": 0.3}).mpc
+        with jax.enable_x64(True):
+            traced = jax.jit(lambda Q, t: task.make({"Q": Q, "tightening": t}).mpc)(Q, 0.3)
+    for made in (found, traced):
+        assert (made.terminal_cost is None) == (expected.terminal_cost is None) == (text == WEAK)
+        for one, other in zip(jax.tree.leaves(made), jax.tree.leaves(expected), strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)
+    if text == SERVOS:
+        loose = jm.robot_mpc(robot, Q, mpc.R, horizon=4)
+        assert np.abs(found.outputs[1].upper - loose.outputs[1].upper).max() > 1e-3

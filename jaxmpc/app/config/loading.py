@@ -175,9 +175,10 @@ def read_toml(path: str | Path) -> dict[str, Any]:
     except RecursionError:
         fail(str(path), "is nested too deeply", "No key takes more than rows of numbers")
     except ValueError as error:  # no TOML, or a number of thousands of digits
-        cure = (
-            "Numbers begin with a digit (0.1), texts stand in quotes. The keys: jaxmpc sweep --help"
-        )
+        cure = "Numbers begin with a digit (0.1), texts stand in quotes"
+        if "overwrite" in str(error) or "twice" in str(error):
+            cure = "Leave one out of the lines that give one key"
+        cure = f"{cure}. The keys: jaxmpc sweep --help"
         fail(str(path), f"is no TOML ({error})", cure)
 
 
