@@ -178,11 +178,12 @@ def test_linear_model_against_the_c_engine(standing):
     np.testing.assert_allclose(model.A, wanted[:, : len(xi)], atol=1e-6)
     np.testing.assert_allclose(model.B, wanted[:, len(xi) :], atol=1e-6)
     cones, by = friction_cones(standing, x, u), np.array(of_forces).T
-    faces = np.array([[-0.5, a, b] for a in (1, -1) for b in (1, -1)])
+    faces = np.array([*([-0.5, a, b] for a in (1, -1) for b in (1, -1)), [-1, 0, 0]])
     np.testing.assert_allclose(cones.C, faces @ by[:, : len(xi)], atol=1e-3)
     np.testing.assert_allclose(cones.D, faces @ by[:, len(xi) :], atol=1e-5)
     slack = cones.upper - cones.C @ xi - cones.D @ u
-    np.testing.assert_allclose(slack, 0.5 * 9.81 * standing.mujoco.body_mass.sum(), rtol=1e-9)
+    weight = 9.81 * standing.mujoco.body_mass.sum()
+    np.testing.assert_allclose(slack, weight * np.array([0.5, 0.5, 0.5, 0.5, 1]), rtol=1e-9)
 
 
 def test_statics_of_four_feet(quadruped):
