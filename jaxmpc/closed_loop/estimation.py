@@ -269,6 +269,8 @@ class KalmanFilter:
                 cure = f"Give ({rows}, k), a row for each entry of {one.kind}, or None"
                 fail(f"{name}.matrix", f"shape {M.shape}", cure)
             require_finite(f"{name}.matrix", M)
+            if concrete(M) and not np.all(np.any(M, axis=0)):
+                fail(f"{name}.matrix", "has a column of zeros, which acts nowhere", "Leave it out")
             k = M.shape[1]
             if one.process is None:
                 fail(f"{name}.process", "is None", "Give standard deviations or a covariance")

@@ -614,6 +614,12 @@ def test_bad_noise_and_observers_are_named():
             lambda: run(observer=KalmanFilter(robot, 1.0, 1.0)),
             "observer.initial: is None for a Robot",
         ),
+        (
+            lambda: run(observer=KalmanFilter(
+                SYSTEM, 1.0, 1.0, C=[[1.0, 0.0]], disturbance=Disturbance("input", 0.1, [[0.0]])
+            )),
+            "matrix: has a column of zeros",
+        ),
         (lambda: run(delay=2), "delay: 2. Give 0 or 1"),
         (lambda: run(delay=0.5), "delay: 0.5. Give a whole"),
         (
