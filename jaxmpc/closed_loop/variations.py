@@ -180,12 +180,11 @@ def _places(robot: Robot, argument: str, name: str, kind: str) -> np.ndarray:
 
 
 def start_room(robot: Robot | LinearPlant) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the coordinates (n,) of home, and how far the limits are below and above it, 1 where
-    there are none."""
-    home = host_coordinates(robot, robot.home)
-    below, above = (
-        np.where(np.isfinite(end), np.abs(end - home), 1.0) for end in robot.state_limits.bounds()
-    )
+    """Return the coordinates (n,) of home, moved inside the limits where it is not, and how far
+    these are below and above it, 1 where there are none."""
+    lower, upper = robot.state_limits.bounds()
+    home = np.clip(host_coordinates(robot, robot.home), lower, upper)
+    below, above = (np.where(np.isfinite(end), np.abs(end - home), 1.0) for end in (lower, upper))
     return home, below, above
 
 

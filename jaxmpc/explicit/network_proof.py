@@ -93,6 +93,7 @@ def prove_network(
     n, m = system.n, system.m
     whole("cells", cells, 1)
     inputs.validate("inputs", m)
+    inputs = inputs.spread(m)
     low, high = inputs.bounds("inputs")
     if not np.all(np.isfinite(low) & np.isfinite(high)):
         fail("inputs", "are unbounded", "Give finite limits, to which the network's input is cut")
@@ -109,7 +110,11 @@ def prove_network(
     size = vertices.max(axis=0) - vertices.min(axis=0)
     H, h = (np.asarray(part, float) for part in goal.half_spaces())
     length = np.abs(H * size).sum(axis=1)
-    H, h = H / length[:, None], h / length  # in units of the set's size
+    if np.any(h[length == 0] < 0):
+        fail("target", "is empty", "Give a set that holds states")
+    # Rows that say something, in units of the set's size; where none does, one that says nothing.
+    H, h, length = (part[length > 0] for part in (H, h, length))
+    H, h = (H / length[:, None], h / length) if len(H) else (np.zeros((1, n)), np.ones(1))
     A, B, c = host_matrices(system)
     with jax.enable_x64(True):
         last = H @ A, H @ B, H @ c - h

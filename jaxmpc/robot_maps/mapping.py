@@ -15,12 +15,12 @@ import numpy as np
 from jaxmpc.arrays import Reals, host_array
 from jaxmpc.batches import Compiled, Part, default_chunk, first_rows, padded, slices, work_off
 from jaxmpc.checks import fail, require_kind, require_shape, whole
-from jaxmpc.closed_loop.robot_controller import RobotController, robot_mpc
+from jaxmpc.closed_loop.robot_controller import RobotController, robot_mpc, robot_references
 from jaxmpc.closed_loop.simulation import simulate_many
 from jaxmpc.feasible.map import FeasibleSetMap
 from jaxmpc.feasible.pipeline import Labels, Scope, labelled_parts
 from jaxmpc.feasible.problem import FeasibilityProblem
-from jaxmpc.mpc.problem import MPC, Outputs, as_tuple
+from jaxmpc.mpc.problem import MPC, Outputs, Soft, as_tuple
 from jaxmpc.pytrees import record
 from jaxmpc.recursion.analysis import examine
 from jaxmpc.recursion.time_budget import Budget
@@ -56,7 +56,7 @@ def map_robot(
 
     Arguments:
         mpc: hard limits, linear about the set-point, from `robot_mpc`.
-        target: as given to `robot_mpc`; None: home.
+        target: as given to `robot_mpc`; None: `robot.set_point()`, home or what it is moved to.
         x0s: points (B, d) in coordinates ξ. axes: indices of the d mapped coordinates, None for
             all; fixed (n,): values of the others, None for those of `robot.home`.
         seconds: length T·dt of the closed loops, in which home (or target) is held as reference.
@@ -139,7 +139,10 @@ class RobotSetting:
         number = isinstance(seconds, int | float) and not isinstance(seconds, bool)
         if not number or not 0 < seconds < math.inf:
             fail("seconds", f"{seconds!r}", "Give a positive number")
-        x, u = robot.equilibrium() if target is None else robot.set_point(target)
+        if claim == "recursion" and as_tuple("soft", mpc.soft, Soft):
+            cure = 'Leave them out, or give claim="limits"'
+            fail("mpc.soft", "has rows, and plans that break them are plans too", cure)
+        reference, inputs = robot_references(robot, target)
         limited = with_initial_limits(mpc, robot.state_limits)
         if axes is not None and fixed is None and len(set(axes)) < robot.n:
             fixed = host_coordinates(robot, robot.home)
@@ -160,8 +163,8 @@ class RobotSetting:
             problem=problem,
             controller=controller,
             x0s=x0s,
-            reference=host_coordinates(robot, x),
-            input_reference=np.asarray(u),
+            reference=reference,
+            input_reference=inputs,
             steps=max(1, round(seconds / robot.dt)),
             claim=claim,
         )
@@ -246,7 +249,7 @@ def mpc_with_terminal(robot: Robot, horizon: int, terminal: str) -> MPC:
     if terminal != "invariant":
         found = named_terminal_set(terminal, mpc.system, None, mpc.states, None)
         return replace(mpc, terminal_set=found)
-    x, (_, u) = host_coordinates(robot, robot.home), robot.equilibrium()
+    x, u = robot_references(robot)
     about = deviations(mpc, x, u)
     # At the set-point c is rounding.
     system = replace(about.system, c=None)
@@ -256,11 +259,12 @@ def mpc_with_terminal(robot: Robot, horizon: int, terminal: str) -> MPC:
 
 
 def with_initial_limits(mpc: MPC, limits: Box) -> MPC:
-    """Return `mpc` with `limits` on x_0 as well, where its own state limits do not hold at k =
-    0."""
+    """Return `mpc` with `limits` on x_0 as well, where its own state limits do not imply them at
+    k = 0."""
     lower, upper = np.asarray(limits.lower, float), np.asarray(limits.upper, float)
     bounded = np.isfinite(lower) | np.isfinite(upper)
-    if not bounded.any() or (mpc.states is not None and 0 in mpc.state_stages):
+    own = mpc.states if 0 in mpc.state_stages else None
+    if not bounded.any() or (own is not None and own.spread(len(lower)).is_subset(limits)):
         return mpc
     system = mpc.system
     names, units = (

@@ -203,6 +203,7 @@ def _grid_lines(
         size = d if value is None else len(value)
         if size != d:
             fail(name, f"has {size} entries where {d} are needed", "One for each axis")
+    shape = tuple(whole("grid", side, 1) for side in shape)
     box = robot.state_limits
     low, high = grid_ends(
         "", lower, upper, lambda: tuple(np.asarray(v)[list(axes)] for v in (box.lower, box.upper))

@@ -1,11 +1,12 @@
 """Random robots: what is drawn, from which ranges, and that no draw depends on another."""
 
+import mujoco
 import numpy as np
 import pytest
 
 import jaxmpc as jm
 from jaxmpc.closed_loop import randomised
-from jaxmpc.closed_loop.variations import plant_numbers
+from jaxmpc.closed_loop.variations import plant_numbers, start_room
 
 ALL = dict(
     mass=(0.9, 1.1), damping=(0.8, 1.2), armature=(0.5, 2.0), gear=(0.7, 1.0), payload=(0.0, 1.0)
@@ -107,3 +108,16 @@ def test_matrices_of_other_shapes_are_named():
 def test_factors_of_other_shapes_are_named(arm):
     with pytest.raises(ValueError, match=r"factors\['mass'\]: shape \(4,\). Give \(B, "):
         plant_numbers(arm, {"mass": np.ones(4)})
+
+
+HELD_OUT = """<mujoco><worldbody><body><joint name="j" axis="0 1 0" range="-86 86" damping=".1"/>
+<geom type="capsule" fromto="0 0 0 0 0 -.4" size=".02" mass="1"/></body></worldbody>
+<actuator><motor joint="j" ctrlrange="-5 5"/></actuator>
+<keyframe><key name="home" qpos="0.9"/></keyframe></mujoco>"""
+
+
+def test_starts_lie_within_the_limits_where_home_does_not():
+    robot = jm.load_robot(mujoco.MjModel.from_xml_string(HELD_OUT), position=0.5, velocity=2.0)
+    home, below, above = start_room(robot)
+    limit = np.array([0.5, 2.0])
+    np.testing.assert_allclose([home - below, home + above], [-limit, limit], atol=1e-12)

@@ -125,6 +125,16 @@ def test_another_target():
     assert shares[0] < shares[1] < shares[2] == pytest.approx(1)
 
 
+def test_targets_that_say_nothing():
+    """All states lead into all of the plane; a row of zeros says nothing beside others."""
+    network, limits = random_network(2, [2, 8, 1]), jm.Box(-0.5, 0.5)  # two numbers, for all inputs
+    whole = prove_network(network, JOINT, UNIT, limits, target=jm.Box(-np.inf, np.inf))
+    assert whole.kept == 1
+    H, h = np.vstack([np.eye(2), -np.eye(2), np.zeros(2)]), np.array([2.0, 2, 2, 2, 1])
+    found = prove_network(network, JOINT, UNIT, limits, target=jm.Polytope(H, h))
+    assert found.kept == pytest.approx(1)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -189,7 +189,7 @@ def test_deviations_are_the_same_problem():
     """Rest is at the origin, steps agree, and a point keeps a row here where it does there."""
     bounds = jm.Outputs(np.ones((1, 2)), [-0.2], [0.3], np.ones((1, 2)))
     mpc = replace(problems.drifting(), outputs=bounds)
-    assert with_initial_limits(mpc, problems.symmetric(0.5, 0.5)) is mpc, "states hold at k = 0"
+    assert with_initial_limits(mpc, problems.symmetric(50.0, 50.0)) is mpc, "states imply them"
     x, random = np.array([0.2, -0.1]), np.random.default_rng(0)
     A, B, c = (np.asarray(v) for v in (mpc.system.A, mpc.system.B, mpc.system.c))
     u = np.linalg.solve(B, x - A @ x - c)
@@ -305,3 +305,33 @@ def test_wrong_options_are_named(line, message, tmp_path, monkeypatch, capsys):
     assert run(line) == 2
     err = capsys.readouterr().err
     assert message in err and err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("states", "added"),
+    [
+        (None, 2),
+        (jm.Box([-1.0, -1.0], [1.0, 1.0]), 0),
+        (jm.Box([-1.0, -2.0], [1.0, 2.0]), 2),
+        (jm.Box([-1.0, -np.inf], [1.0, np.inf]), 2),
+        (jm.Polytope([[1.0, 0.0]], [0.5]), 2),
+    ],
+)
+def test_limits_of_the_robot_hold_at_first(states, added):
+    """Whatever those of the problem are: a state beyond them has no plan."""
+    system = jm.LinearSystem([[1.0, 0.1], [0.0, 1.0]], [0.0, 0.1], dt=0.1)
+    mpc = jm.MPC(system, np.eye(2), 1.0, 3, states=states, inputs=jm.Box(-1.0, 1.0))
+    limited = with_initial_limits(mpc, jm.Box([-1.0, -1.0], [1.0, 1.0]))
+    assert sum(len(rows.lower) for rows in limited.outputs) == added
+    points = np.array([[0.4, 0.4], [0.4, 1.5], [-1.2, 0.0], [-1.0, 0.0]])
+    labels = jm.map_feasible_set(limited, points).label
+    np.testing.assert_array_equal(labels, [1, -1, -1, 1])
+
+
+def test_what_is_no_map_is_named():
+    robot = jm.load_robot("pendulum")
+    mpc = jm.robot_mpc(robot, horizon=3)
+    soft = replace(mpc, soft=jm.Soft([1.0, 0.0], upper=0.2))
+    with pytest.raises(ValueError, match="mpc.soft: has rows.*claim=.limits"):
+        map_robot(robot, soft, np.zeros((1, 2)), claim="recursion")
+    assert run("sweep --robot pendulum --grid 0 2 --seconds 0.1") == 2
