@@ -36,9 +36,9 @@ class Feedback(Protocol):
     mpc: whose horizon and weights evaluate the loop. dtype: the precision of the inputs.
     state_size: the length of the plant's state. limits: by which the plant's states are evaluated.
     One that follows a motion of its own, as `GaitController` does, also has `motion(t)`, the state
-    and input at step t; `distance(x, xi, t)`, by which states are apart then; `begun(before, t)`,
-    what `start` gives for plans that begin at step t; and `numbers_at(t)`, the numbers of the
-    robot's model then.
+    and input at step t, and may have `distance(x, xi, t)`, how far x is from ξ in the coordinates
+    that are weighed then; `begun(before, t)`, what `start` gives for plans that begin at step t;
+    and `numbers_at(t)`, the numbers of the robot's model then.
     """
 
     @property

@@ -364,6 +364,7 @@ class Loop:
         if hasattr(controller, "motion"):
             own_r, own_s = controller.motion(t)
             r, s = own_r if r is None else first_row(r, x.dtype), own_s if s is None else s
+        if hasattr(controller, "distance"):
             error = controller.distance(x, r, t)
         else:
             error = _distance(controller.coordinates(x), r)

@@ -89,14 +89,15 @@ def checked_aim(
 
 
 def _where_steps_do_something(mpc: MPC, forecast: Any) -> Any:
-    """Return a forecast; a constant one (n,) of a problem with steps that do nothing, those that
-    `pad_horizon` adds, as rows (N, n) that are zero there."""
+    """Return a forecast; a constant one (n,) of a problem that ends in steps that do and cost
+    nothing, as `pad_horizon` adds them, as rows (N, n) that are zero there."""
     A, B, Q = (as_array(v) for v in (mpc.system.A, mpc.system.B, mpc.Q))
     if forecast is None or np.ndim(forecast) > 1 or min(v.ndim for v in (A, B, Q)) < 3:
         return forecast
     xp = np if concrete(A, B, Q, forecast) else jnp
-    still = xp.all(A == np.eye(A.shape[-1]), axis=(1, 2))
+    still = xp.all(A == xp.eye(A.shape[-1], dtype=A.dtype), axis=(1, 2))
     idle = still & ~xp.any(B, axis=(1, 2)) & ~xp.any(Q, axis=(1, 2))
+    idle = xp.cumsum(~idle[::-1])[::-1] == 0  # to the end
     return xp.where(idle[:, None], xp.zeros_like(forecast), forecast)
 
 

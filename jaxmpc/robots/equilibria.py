@@ -284,18 +284,18 @@ def require_rest(
     touching: where contacts or stops do, return the sentence instead.
     """
     plant, smooth = robot.mujoco, robot.predictor.model
-    feet = getattr(robot.predictor, "feet", None)
     file = copy.deepcopy(robot.file or plant)
     # Inputs are not clamped, and of a motor's force limits the box of inputs is in charge.
     file.opt.disableflags |= flag("clampctrl")
     file.actuator_forcelimited[:] = plant.actuator_forcelimited
     file.jnt_actfrclimited[:] = plant.jnt_actfrclimited
     file.actuator_delay[:] = 0  # inputs at rest are old enough
-    if feet is not None:
-        # MuJoCo's contacts are springs, into which a robot sinks first: the rest is compared
-        # without feet in both models, in which it falls.
-        file.geom_contype[feet.geoms] = file.geom_conaffinity[feet.geoms] = 0
-        file.pair_margin[:] = -np.inf
+    if hasattr(robot.predictor, "feet"):
+        # MuJoCo's contacts are springs, into which a robot sinks first: of limits of forces alone
+        # it is asked whether they change what happens, without the ground.
+        for kind in ("contact", "limit", "frictionloss"):
+            file.opt.disableflags |= flag(kind)
+        smooth = _without(file, "")
     limited, single = file.jnt_limited.copy(), single_joints(file)
     at, dof = file.jnt_qposadr[single], file.jnt_dofadr[single]
     low, high = (end[dof] for end in robot.state_limits.bounds())

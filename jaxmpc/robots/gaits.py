@@ -112,7 +112,7 @@ class Gait:
         if not concrete(start, self.states):
             steps = start + jnp.arange(count)
             return jax.vmap(self.in_the_world)(jnp.asarray(self.states)[steps % self.period], steps)
-        with jax.enable_x64(True):
+        with jax.enable_x64(True), jax.ensure_compile_time_eval():
             steps = start + np.arange(count)
             states = np.asarray(self.states, float)[steps % self.period]
             return np.asarray(jax.vmap(self.in_the_world)(states, steps))
@@ -120,15 +120,15 @@ class Gait:
     def relative(self, x: Array, t: Any) -> Array:
         """Return the coordinates (n,), relative to the path, of a state x (nq + nv + na,) at the
         control period t."""
-        return self.robot.coordinates(self._moved(x, -t))
+        return self.robot.coordinates(self._moved(x, t, -1.0))
 
     def in_the_world(self, relative: Array, t: Any) -> Array:
         """Return the coordinates ξ (n,) that these are at the control period t."""
         return self.robot.coordinates(self._moved(self.robot.state(relative), t))
 
-    def _moved(self, x: Array, t: Any) -> Array:
+    def _moved(self, x: Array, t: Any, sign: float = 1.0) -> Array:
         x = as_floats(x)
-        seconds = jnp.asarray(t * self.robot.dt, x.dtype)
+        seconds = sign * self.robot.dt * jnp.asarray(t, x.dtype)
         path = jax.tree.map(lambda v: jnp.asarray(v, x.dtype), self.path)
         return path.state(x, self.robot.mujoco.nq, seconds)
 
@@ -188,7 +188,7 @@ def gait(
         fail("feet", f"{', '.join(feet)} do not carry {robot.name} at home", cure)
     places = _places(model, x_rest[: model.nq], feet)
     starts = (
-        _alternating(places - places.mean(axis=0))
+        _alternating(places - places.mean(axis=0), x_rest[3:7])
         if offsets is None
         else np.asarray(offsets, float)
     )
@@ -209,7 +209,7 @@ def gait(
     v[:, :2], v[:, 6:] = velocity, speeds
     _require_slow(robot, speeds)
     # (Angular velocities of a free base are in its own frame.)
-    v[:, 3:6] = turn * _upwards(x_rest[3:7])
+    v[:, 3:6] = turn * _matrix(x_rest[3:7])[2]
     rest = np.broadcast_to(x_rest[model.nq + model.nv :], (count, model.na))
     states = host_coordinates(robot, np.hstack([q, v, rest]))
 
@@ -263,11 +263,11 @@ def _require_slow(robot: Robot, speeds: np.ndarray) -> None:
         fail("velocity", problem, "Give a smaller velocity, turn or lift, or a longer period")
 
 
-def _upwards(quaternion: np.ndarray) -> np.ndarray:
-    """Return the direction z (3,) of the world in the frame of a body with this orientation."""
+def _matrix(quaternion: np.ndarray) -> np.ndarray:
+    """Return the axes of a body with this orientation in the world, as columns."""
     matrix = np.empty(9)
     mujoco.mju_quat2Mat(matrix, quaternion)
-    return matrix.reshape(3, 3)[2]
+    return matrix.reshape(3, 3)
 
 
 @compiled_lightly(0)
@@ -295,9 +295,12 @@ def _models(
     return jax.vmap(at)(states, standing)
 
 
-def _alternating(places: np.ndarray) -> np.ndarray:
-    """Return 0 and ½ for every other foot round the trunk; places (k, 3) from their middle."""
-    order = np.argsort(np.arctan2(places[:, 1], places[:, 0]))
+def _alternating(places: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
+    """Return 0 and ½ for every other foot round the trunk, whatever its heading; places (k, 3) from
+    their middle, quaternion of the trunk."""
+    ahead, aside = _matrix(quaternion)[:2, 0]
+    angles = np.arctan2(places[:, 1], places[:, 0]) - np.arctan2(aside, ahead)
+    order = np.argsort((angles + np.pi) % (2 * np.pi))
     starts = np.zeros(len(places))
     starts[order[1::2]] = 0.5
     return starts

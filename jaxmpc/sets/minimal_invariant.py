@@ -43,11 +43,12 @@ class MinimalInvariantSet(ConvexSet):
     invariant set and is robust invariant itself.
 
     closed (n, n): A + BK. E (n, p), disturbance: W. spread (n,): zero where E W has volume around
-    the origin, and along coordinates that nothing moves. alpha: with closed^steps (E W ⊕ …) ⊆
-    alpha (E W ⊕ …). normals (k, n): the directions in which that was compared, which show it, with
-    coordinates that nothing moves. excess: along a coordinate, up or down, F reaches at
-    most 1 + excess times as far as the minimal set, where that reaches anywhere. exact_alpha: an
-    upper bound of the least such alpha in rational arithmetic, with W a Box; else None.
+    the origin, and along coordinates that nothing moves. alpha: with closed^steps (E W ⊕ …) ⊆ alpha
+    (E W ⊕ …). normals (k, n): the directions in which that was compared; they show it, for along
+    coordinates that nothing moves both sets are the origin. excess: along a coordinate, up or down,
+    F reaches at most 1 + excess times as far as the minimal set, where that reaches anywhere.
+    exact_alpha: an upper bound of the least such alpha in rational arithmetic, with W a Box; else
+    None.
 
     All methods run in NumPy, not traceable.
     """

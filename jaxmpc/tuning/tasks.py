@@ -277,14 +277,15 @@ def robot_task(
 ) -> WeightTask:
     """Return the task of a robot under `RobotController`, which rests at `target`.
 
-    terminal_weight, terms: as in `linear_task`. target: configuration to rest at.
+    terminal_weight, terms: as in `linear_task`; "lqr" follows a terminal cost that there is, which
+    `robot_mpc` leaves out where the set-point does not rest. target: configuration to rest at.
     mpc: of `robot_mpc` for this target. x0s, factors: of `draw_robots`; the MPC keeps
     the nominal model. linearize, rho, solver: of `RobotController`. The rest as in `linear_task`.
     """
     reference, input_reference = robot_references(robot, target)
     with jax.enable_x64(True):
         x = np.asarray(robot.state(reference))
-    if mpc.terminal_cost is None:  # no LQR: the set-point does not rest
+    if mpc.terminal_cost is None and terminal_weight == "lqr":
         terminal_weight = "given"
     loss = weight_loss(mpc.Q, mpc.R, robot.state_limits, reference, input_reference, robot, **terms)
     variations = plant_numbers(robot, dict(factors or {}))

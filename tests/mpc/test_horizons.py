@@ -133,3 +133,14 @@ def test_constant_forecasts_are_of_the_steps_of_the_problem():
         assert plan.solved
         np.testing.assert_allclose(plan.cost, alone.cost, rtol=1e-9)
         np.testing.assert_allclose(plan.inputs[:3], alone.inputs, atol=1e-7)
+
+
+def test_steps_that_wait_are_no_padding():
+    """A step that does nothing between others has a constant forecast; float32 stays float32."""
+    A = np.stack([np.eye(2), [[1, 0.2], [0, 1]], np.eye(2), [[1, 0.2], [0, 1]]])
+    B = np.array([[0, 0], [0.02, 0.2], [0, 0], [0.02, 0.2]])[:, :, None]
+    Q = np.stack([np.zeros((2, 2)), np.eye(2)] * 2)
+    mpc = jm.MPC(jm.LinearSystem(A, B), Q, 0.1, 4, terminal_cost=np.eye(2), inputs=jm.Box(-1, 1))
+    push = np.array([0.03, -0.02])
+    plans = [jm.solve(mpc, [0.5, 0.1], forecast=w) for w in (push, np.tile(push, (4, 1)))]
+    np.testing.assert_allclose(plans[0].states, plans[1].states, atol=1e-9)

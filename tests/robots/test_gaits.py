@@ -448,7 +448,7 @@ def test_a_quadruped_trots_along_a_circle(robot, turning):
         assert abs((heading[-1] - heading[-45]) / 0.44 - 0.8) < 0.05
         away = np.abs(states[-1, :2] - turning.reference(steps + 1)[-1, :2])
         assert away.max() < 0.03 and np.abs(np.array(costs)[100:, :3]).max() < 0.03
-        # Eight periods later the heading has passed half a turn.
+        # Ten periods later the heading has passed half a turn.
         x = np.asarray(turning.robot.state(turning.states[5])) + np.r_[0.01, np.zeros(36)]
         one = plan(controller, x, controller.begun(controller.start(x), 5))
         later = 5 + 10 * P
@@ -480,3 +480,16 @@ def test_limits_of_the_place_are_those_of_the_world(robot, gait):
     slack = np.asarray(control.plan.slack)[1:, names.index(robot.state_names[0])]
     np.testing.assert_allclose(np.maximum(excess, 0), slack, atol=1e-6)
     assert excess.max() < 0.02
+
+
+@pytest.mark.slow
+def test_references_are_constants_of_programs(turning):
+    """At a step that is known, inside `jit` too; times of any type of whole numbers."""
+    with jax.enable_x64(True):
+        expected = turning.reference(3, 70)
+        found = jax.jit(lambda: jnp.asarray(turning.reference(3, 70)))()
+        np.testing.assert_allclose(found, expected, atol=1e-12)
+        x = turning.robot.state(expected[0])
+        for time in (70, np.uint8(70), jnp.uint32(70)):
+            relative = turning.relative(x, time)
+            np.testing.assert_allclose(relative, turning.states[70 % turning.period], atol=1e-9)
