@@ -139,7 +139,8 @@ def stopping_limits(robot: RobotDescription, q: Any, positions: Box) -> Stopping
     xp = np if concrete(positions) else jnp
     lower, upper = (xp.asarray(side) for side in (positions.lower, positions.upper))
     bounded = np.isfinite(np.subtract(*robot.state_limits.bounds()))
-    # v ≤ √(2 a d) at the distances d = D w, w the width of the range: chords of the slopes k/√w.
+    # Chords of v = √(2 a d) between distances d = D w, w the width of the range: √(w/a) v = √(2 D),
+    # so that their slopes are √(a/w) times these.
     speeds = np.sqrt(2 * DISTANCES)
     slopes = np.diff(speeds) / np.diff(DISTANCES)
     rows = list[tuple[Any, Any, str]]()
