@@ -9,7 +9,7 @@ import xarray as xr
 import zarr
 from test_store import AXES, CONFIG, FIELDS, array_files, bounds, rows
 
-from jaxmpc import store
+from jaxmpc import files, store
 from jaxmpc.app.options.shared import chosen_shard
 from jaxmpc.store import Store
 from jaxmpc.store.reading import zarr_place
@@ -123,7 +123,7 @@ class TestDamage:
         for i in range(2):
             with open_shard(path, (i, 2)) as kept:
                 fill(kept)
-        making = path.with_name(".sweep.zarr.123")
+        making = files.side_path(path)
         making.mkdir()
         writing = path / "label" / "c" / "0" / "0.123.partial"
         writing.touch()
