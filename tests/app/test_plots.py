@@ -488,9 +488,9 @@ def test_a_plan_over_its_horizon():
     np.testing.assert_allclose(upper[dq].values, [2, 2, 2, np.nan])
     np.testing.assert_allclose(upper[torque].values, [2, 2, 2])
     np.testing.assert_allclose(upper[torque].edges, [0, 0.1, 0.2, 0.3])
-    np.testing.assert_allclose(dq.lines[1].get_ydata(), [-2, -2, -2, np.nan])
-    np.testing.assert_allclose(q.lines[3].get_xdata(), [0.2])
-    np.testing.assert_allclose(torque.lines[3].get_xdata(), [0.2, 0.3])
+    np.testing.assert_allclose(dq.patches[0].get_data().values, [-2, -2, -2, np.nan])
+    np.testing.assert_allclose(q.lines[1].get_xdata(), [0.2])
+    np.testing.assert_allclose(torque.lines[1].get_xdata(), [0.2, 0.3])
     require_no_empty_panel(figure)
     # Each row is one of its own: beside one of inputs, with rounding, and in any unit.
     for unit in (1.0, 1e-7):
@@ -499,7 +499,7 @@ def test_a_plan_over_its_horizon():
         scaled = dataclasses.replace(plan, states=x * unit)
         changed = dataclasses.replace(mpc, states=None, outputs=(), soft=(soft,))
         ax = plot_plan(scaled, changed).axes[0]
-        assert ax.lines[2].get_ydata()[2] == pytest.approx(0.5 * unit)
+        assert ax.patches[2].get_data().values[2] == pytest.approx(0.5 * unit)
         red = [line for line in ax.lines if line.get_color() == BROKEN]
         np.testing.assert_array_equal(red[0].get_ydata(), unit * x[2:3, 0])
     lost = dataclasses.replace(plan, status=np.int32(jm.Status.PRIMAL_INFEASIBLE))
