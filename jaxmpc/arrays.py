@@ -139,6 +139,14 @@ def as_array(value: Any) -> Any:
     return value if concrete(value) else jnp.asarray(value)
 
 
+def as_floats(value: Any) -> Any:
+    """Return `value` as an array that keeps its floating dtype; traced values stay traced. Whole
+    numbers become floating ones, for what is computed in their type would be truncated."""
+    value = as_array(value)
+    value = value if isinstance(value, jax.Array) else np.asarray(value)
+    return value if jnp.issubdtype(value.dtype, jnp.floating) else value.astype(float)
+
+
 def all_finite(tree: Any) -> jax.Array:
     """Return whether all numbers of a tree are finite. Works inside jit, vmap and grad."""
     tests = [jnp.all(jnp.isfinite(jnp.asarray(v))) for v in jax.tree.leaves(tree)]

@@ -7,14 +7,14 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxmpc.arrays import Reals, as_weight
+from jaxmpc.arrays import Reals, as_floats, as_weight
 from jaxmpc.checks import fail, number, require_kind, require_shape, require_symmetric_psd, whole
 from jaxmpc.closed_loop.feedback import Feedback, model_of
 from jaxmpc.closed_loop.robot_controller import robot_mpc
 from jaxmpc.closed_loop.variations import free_motions, start_room
 from jaxmpc.mpc.plan import limited
 from jaxmpc.pytrees import pytree, static
-from jaxmpc.qp.linalg import as_floats, matmul
+from jaxmpc.qp.linalg import matmul
 from jaxmpc.robots.description import host_coordinates
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.robot import Robot
@@ -124,7 +124,7 @@ class Environment:
     def at(self, x: Any) -> EnvironmentState:
         """Return the start of an episode at the state x (nq + nv,)."""
         require_shape("x", x, (self.robot.state_size,), "One state; use jax.vmap for many")
-        x = as_floats(x)
+        x = jnp.asarray(as_floats(x))
         return self._state(x, jnp.zeros(()), jnp.asarray(0))
 
     def step(self, state: EnvironmentState, action: Any) -> EnvironmentState:

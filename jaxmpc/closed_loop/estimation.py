@@ -12,7 +12,7 @@ import numpy as np
 import scipy
 from jax import Array
 
-from jaxmpc.arrays import dimensions
+from jaxmpc.arrays import as_floats, dimensions
 from jaxmpc.checks import (
     concrete,
     fail,
@@ -25,7 +25,7 @@ from jaxmpc.checks import (
 )
 from jaxmpc.mpc.stagewise.nonlinear import NonlinearMPC, linear_model
 from jaxmpc.pytrees import named_pytree, pytree, static
-from jaxmpc.qp.linalg import arrays, as_floats, matmul, solve, symmetric, symmetric_root
+from jaxmpc.qp.linalg import arrays, matmul, solve, symmetric, symmetric_root
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.parameters import FIELDS, NONNEGATIVE, OF_PLANTS, PAYLOAD, require_numbers
 from jaxmpc.robots.robot import Robot, RobotModel
@@ -426,12 +426,12 @@ class KalmanFilter:
 
     def outputs(self, xi: Array) -> Array:
         """Return C ξ (p,)."""
-        xi = as_floats(xi)
+        xi = jnp.asarray(as_floats(xi))
         return xi[: self.p] if self.C is None else matmul(jnp.asarray(self.C, xi.dtype), xi)
 
     def first(self, xi: Array) -> Belief:
         """Return the estimate before the first output, where the plant starts at ξ; d is 0."""
-        xi = as_floats(xi)
+        xi = jnp.asarray(as_floats(xi))
         state = xi if self.start is None else jnp.asarray(self.start, xi.dtype)
         mean = jnp.concatenate([state, jnp.zeros(self.disturbances, xi.dtype)])
         if self.gain is not None:

@@ -132,14 +132,6 @@ def floating_dtype(tree: Any) -> jnp.dtype:
     return jnp.dtype(jnp.float64 if jnp.dtype(jnp.float64) in floats else jnp.float32)
 
 
-def as_floats(value: Any) -> Array:
-    """Return a value as an array of JAX; whole numbers as its default floating numbers, for what
-    is computed in the type of an array of them would be truncated."""
-    value = jnp.asarray(value)
-    floating = jnp.issubdtype(value.dtype, jnp.floating)
-    return value if floating else value.astype(jnp.result_type(float))
-
-
 def cast(tree: T, dtype: DTypeLike) -> T:
     """Return the tree with floating leaves of this type."""
     floating = lambda v: jnp.issubdtype(v.dtype, jnp.floating)

@@ -34,9 +34,10 @@ import numpy as np
 from jax import Array
 from scipy.linalg import block_diag
 
+from jaxmpc.arrays import as_floats
 from jaxmpc.checks import fail, number
 from jaxmpc.pytrees import record
-from jaxmpc.qp.linalg import as_floats, matmul, solve
+from jaxmpc.qp.linalg import matmul, solve
 from jaxmpc.robots.configurations import normalised, retract
 from jaxmpc.robots.description import RobotDescription
 from jaxmpc.robots.force_limits import ForceLimits
@@ -225,7 +226,7 @@ class StandingPhysics(Physics):
         physics: Any = self.acting(numbers)
         if physics is not self:
             return physics.contact_forces(x, u, numbers)
-        x, u = as_floats(x), as_floats(u)
+        x, u = (jnp.asarray(as_floats(v)) for v in (x, u))
         q, v, act = jnp.split(x, [self.model.nq, self.model.nq + self.model.nv])
         return self._standing(in_force(numbers), normalised(self.joints, q), v, act, u)[1]
 

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxmpc.arrays import host_array
+from jaxmpc.arrays import as_floats, host_array
 from jaxmpc.checks import fail, require_finite, require_shape
 from jaxmpc.pytrees import record, static
-from jaxmpc.qp.linalg import as_floats, floating_dtype
+from jaxmpc.qp.linalg import floating_dtype
 from jaxmpc.robots.configurations import difference, quaternions, retract, unit_orientations
 from jaxmpc.robots.mujoco_access import acts, mjx_module, mujoco, single_joints, word
 from jaxmpc.robots.physics import Physics
@@ -118,7 +118,7 @@ class RobotDescription:
 
     def coordinates(self, x: Any) -> Array:
         """Return ξ (n,) of a state x (nq + nv + na,)."""
-        x = as_floats(x)
+        x = jnp.asarray(as_floats(x))
         require_shape("x", x, (self.state_size,), "Give (qpos, qvel, act) of one robot")
         if not quaternions(self.joints):
             return x
@@ -128,7 +128,7 @@ class RobotDescription:
 
     def state(self, coordinates: Any) -> Array:
         """Return x (nq + nv + na,) with the coordinates ξ (n,)."""
-        xi = as_floats(coordinates)
+        xi = jnp.asarray(as_floats(coordinates))
         require_shape("coordinates", xi, (self.n,), "Two numbers a dof; use jax.vmap for many")
         if not quaternions(self.joints):
             return xi

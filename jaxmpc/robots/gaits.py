@@ -23,10 +23,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxmpc.arrays import as_floats
 from jaxmpc.checks import concrete, fail, number, require_finite, require_kind, require_shape
 from jaxmpc.pytrees import named_pytree, pytree, static
 from jaxmpc.qp.jax_transformations import compiled_lightly
-from jaxmpc.qp.linalg import as_floats, matmul
+from jaxmpc.qp.linalg import matmul
 from jaxmpc.robots.configurations import product
 from jaxmpc.robots.contacts import FACES, STANDING, linear_cones
 from jaxmpc.robots.description import host_coordinates
@@ -127,7 +128,7 @@ class Gait:
         return self.robot.coordinates(self._moved(self.robot.state(relative), t))
 
     def _moved(self, x: Array, t: Any, sign: float = 1.0) -> Array:
-        x = as_floats(x)
+        x = jnp.asarray(as_floats(x))
         seconds = sign * self.robot.dt * jnp.asarray(t, x.dtype)
         path = jax.tree.map(lambda v: jnp.asarray(v, x.dtype), self.path)
         return path.state(x, self.robot.mujoco.nq, seconds)

@@ -35,13 +35,6 @@ def product(xp: ModuleType, M: Any, v: Any) -> Any:
     return M @ v if xp is np else jnp.matmul(M, v, precision="highest")
 
 
-def as_floats(value: Reals) -> AnyArray:
-    """Return `value` as an array that keeps its floating dtype; traced values stay traced."""
-    value = as_array(value)
-    value = value if isinstance(value, jax.Array) else np.asarray(value)
-    return value if jnp.issubdtype(value.dtype, jnp.floating) else value.astype(float)
-
-
 def one_or_many(argument: str, value: Reals, n: int) -> tuple[Any, bool]:
     """Return an argument as an array of one vector (n,) or of many (k, n), and whether it is
     many."""

@@ -19,7 +19,15 @@ import jax
 import numpy as np
 import scipy
 
-from jaxmpc.arrays import Reals, as_array, dimensions, fill, host_array, store_floats
+from jaxmpc.arrays import (
+    Reals,
+    as_array,
+    as_floats,
+    dimensions,
+    fill,
+    host_array,
+    store_floats,
+)
 from jaxmpc.checks import (
     concrete,
     fail,
@@ -37,7 +45,6 @@ from jaxmpc.sets.fields import (
     AnyNumber,
     AnyTruth,
     affine_map,
-    as_floats,
     chosen_axes,
     numbers,
     one_or_many,

@@ -9,7 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 
-from jaxmpc.arrays import Reals, as_array, as_column, dimensions, host_array, store_floats
+from jaxmpc.arrays import (
+    Reals,
+    as_array,
+    as_column,
+    as_floats,
+    dimensions,
+    host_array,
+    store_floats,
+)
 from jaxmpc.checks import (
     concrete,
     fail,
@@ -21,7 +29,7 @@ from jaxmpc.checks import (
     require_shape,
 )
 from jaxmpc.pytrees import prepared_pytree, static
-from jaxmpc.qp.linalg import as_floats, matmul
+from jaxmpc.qp.linalg import matmul
 
 _TEXTS = ("state_names", "input_names", "state_units", "input_units")
 _DELAY = (
@@ -125,7 +133,7 @@ class LinearSystem:
     def step(self, x: Reals, u: Reals) -> jax.Array:
         """Return A x + B u + c for x (n,) and u (m,), computed in the dtype of x; of a system that
         differs from step to step the first step."""
-        x = as_floats(x)
+        x = jnp.asarray(as_floats(x))
         parts = (self.A, 2), (self.B, 2), (0.0 if self.c is None else self.c, 1)
         every = ((jnp.asarray(v, x.dtype), axes) for v, axes in parts)
         A, B, c = (v[0] if v.ndim > axes else v for v, axes in every)

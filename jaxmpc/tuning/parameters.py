@@ -23,10 +23,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxmpc.arrays import host_array
+from jaxmpc.arrays import as_floats, host_array
 from jaxmpc.checks import fail, require_finite, require_symmetric_psd
 from jaxmpc.pytrees import record
-from jaxmpc.qp.linalg import as_floats
 
 DOMAINS = ("real", "positive", "interval", "diagonal", "definite")
 
@@ -120,7 +119,7 @@ class Parameter:
     def at(self, raw: Any) -> Array:
         """Return the value where the trained entries have the θ (k,). Works inside jit, vmap and
         grad."""
-        raw = as_floats(raw)
+        raw = jnp.asarray(as_floats(raw))
         theta = jnp.asarray(self._free(self.value), raw.dtype).at[self.train].set(raw)
         if self.domain == "positive":
             return _positive(theta)
