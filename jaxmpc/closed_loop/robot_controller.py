@@ -146,7 +146,7 @@ def _limits_of_forces(
         yield replace(stopping, stages=(0, horizon))
 
 
-def tightened(robot: Robot | LinearPlant, mpc: MPC, x: np.ndarray, margin: Any) -> MPC:
+def with_margin(robot: Robot | LinearPlant, mpc: MPC, x: np.ndarray, margin: Any) -> MPC:
     """Return the problem of a robot that rests at x with its state limits tightened by another
     fraction, which may be traced, and with rows that stop its joints within these."""
     states = robot.state_limits.tightened(margin)

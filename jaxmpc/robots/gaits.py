@@ -203,16 +203,7 @@ def gait(
     goals = np.empty((count, len(feet), 3))
     goals[:, :, :2] = _paths(path, places[:, :2], phases, duty, count * robot.dt * duty)
     goals[:, :, 2] = places[:, 2] + lift * _arc(phases, duty)
-    q = _joints(robot, x_rest[: model.nq], feet, goals)
-    joints = q[:, 7:]
-    speeds = (np.roll(joints, -1, axis=0) - np.roll(joints, 1, axis=0)) / (2 * robot.dt)
-    v = np.zeros((count, model.nv))
-    v[:, :2], v[:, 6:] = velocity, speeds
-    _require_slow(robot, speeds)
-    # (Angular velocities of a free base are in its own frame.)
-    v[:, 3:6] = turn * _matrix(x_rest[3:7])[2]
-    rest = np.broadcast_to(x_rest[model.nq + model.nv :], (count, model.na))
-    states = host_coordinates(robot, np.hstack([q, v, rest]))
+    states = _states(robot, x_rest, _joints(robot, x_rest[: model.nq], feet, goals), path)
 
     with jax.enable_x64(True):
         given = (jnp.asarray(v, float) for v in (states, u_rest, standing))
@@ -250,6 +241,20 @@ def _require_swings(feet: Sequence[str], standing: np.ndarray, duty: float) -> N
             what = f"{duty}: {foot} stands at {stands} of {count} control periods"
             by = "another duty, a longer period or a shorter control_period"
             fail("duty", what, f"Let it stand at 1 of them and swing at {_SWING} at least: {by}")
+
+
+def _states(robot: Robot, x_rest: np.ndarray, q: np.ndarray, path: TrunkPath) -> np.ndarray:
+    """Return the coordinates (P, n) of configurations (P, nq) that repeat themselves, with the base
+    at home, moving along the path; activations are those of the rest."""
+    model, joints = robot.mujoco, q[:, 7:]
+    speeds = (np.roll(joints, -1, axis=0) - np.roll(joints, 1, axis=0)) / (2 * robot.dt)
+    _require_slow(robot, speeds)
+    v = np.zeros((len(q), model.nv))
+    v[:, :2], v[:, 6:] = path.velocity, speeds
+    # (Angular velocities of a free base are in its own frame.)
+    v[:, 3:6] = path.turn * _matrix(x_rest[3:7])[2]
+    rest = np.broadcast_to(x_rest[model.nq + model.nv :], (len(q), model.na))
+    return host_coordinates(robot, np.hstack([q, v, rest]))
 
 
 def _require_slow(robot: Robot, speeds: np.ndarray) -> None:

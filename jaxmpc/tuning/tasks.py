@@ -21,7 +21,7 @@ from jaxmpc.closed_loop.robot_controller import (
     RobotController,
     lqr_cost,
     robot_references,
-    tightened,
+    with_margin,
 )
 from jaxmpc.closed_loop.simulation import Run, simulate_many
 from jaxmpc.closed_loop.variations import plant_numbers
@@ -294,7 +294,7 @@ def robot_task(
     def make(values: Values) -> RobotController:
         made = _weighted(mpc, values, terminal_weight)
         if "tightening" in values:
-            made = tightened(robot, made, x, values["tightening"])
+            made = with_margin(robot, made, x, values["tightening"])
         return RobotController(robot, made, solver, linearize=linearize, rho=values.get("rho", rho))
 
     return WeightTask(
