@@ -218,6 +218,13 @@ def number(argument: str, value: Any, least: float, cure: str) -> None:
         fail(argument, f"{value}", cure)
 
 
+def positive(argument: str, value: Any) -> None:
+    """Raise unless a readable `value` is one finite number above 0."""
+    number(argument, value, np.finfo(np.float64).tiny, "Give a positive number")
+    if concrete(value) and np.isinf(value):
+        fail(argument, f"{value}", "Give a finite number")
+
+
 def require_shape(argument: str, value: Any, shape: tuple[int, ...], cure: str) -> None:
     """Raise unless `value` holds real numbers and has exactly this shape."""
     import jax.numpy as jnp

@@ -116,6 +116,9 @@ class Environment:
         kind = getattr(key, "dtype", None)
         if kind is None or not (kind == jnp.uint32 or jnp.issubdtype(kind, jax.dtypes.prng_key)):
             fail("key", f"{key!r}", "Give a JAX key: jax.random.key(0)")
+        if key.ndim != (kind == jnp.uint32):
+            what = f"is an array of keys, shape {key.shape}"
+            fail("key", what, "Give one, or use jax.vmap(environment.reset)(keys)")
         aside = jax.random.uniform(key, (self.robot.n,), minval=-1.0, maxval=1.0)
         room = jnp.where(aside > 0, jnp.asarray(self.above), jnp.asarray(self.below))
         start = room * aside if self.motions is None else matmul(self.motions, room * aside)

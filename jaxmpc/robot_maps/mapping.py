@@ -3,7 +3,6 @@
 Below that the linear problem itself: limits on x_0, terminal sets, deviations from a set-point.
 """
 
-import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -14,7 +13,7 @@ import numpy as np
 
 from jaxmpc.arrays import Reals, host_array
 from jaxmpc.batches import Compiled, Part, default_chunk, first_rows, padded, slices, work_off
-from jaxmpc.checks import fail, require_kind, require_shape, whole
+from jaxmpc.checks import fail, number, positive, require_kind, require_shape, whole
 from jaxmpc.closed_loop.robot_controller import RobotController, robot_mpc, robot_references
 from jaxmpc.closed_loop.simulation import simulate_many
 from jaxmpc.feasible.map import FeasibleSetMap
@@ -83,6 +82,7 @@ def map_robot(
         "fixed": fixed,
     }
     setting = RobotSetting.of(robot, mpc, x0s, seconds, claim=claim, **given)
+    number("search_seconds", search_seconds, 0.0, "Give at least 0")
     found: list[tuple[Labels, RobotLoops]] = []
     total, size = len(setting.x0s), setting.chunk(chunk)
     parts = setting.parts(slices(total, size), setting.x0s.__getitem__, size)
@@ -136,15 +136,13 @@ class RobotSetting:
             fail("mpc", f"has {sizes} states and inputs", f"This robot has {needed}: see robot_mpc")
         if mpc.input_in_state:
             fail("mpc", "limits or weighs input rates", "A state alone decides nothing then")
-        number = isinstance(seconds, int | float) and not isinstance(seconds, bool)
-        if not number or not 0 < seconds < math.inf:
-            fail("seconds", f"{seconds!r}", "Give a positive number")
+        positive("seconds", seconds)
         if claim == "recursion" and as_tuple("soft", mpc.soft, Soft):
             cure = 'Leave them out, or give claim="limits"'
             fail("mpc.soft", "has rows, and plans that break them are plans too", cure)
         reference, inputs = robot_references(robot, target)
         limited = with_initial_limits(mpc, robot.state_limits)
-        if axes is not None and fixed is None and len(set(axes)) < robot.n:
+        if axes is not None and fixed is None:
             fixed = host_coordinates(robot, robot.home)
         if fixed is not None:
             require_shape("fixed", fixed, (robot.n,), "One value a coordinate")
@@ -157,6 +155,11 @@ class RobotSetting:
         if controller is None:
             with jax.enable_x64(True):
                 controller = RobotController(robot, mpc, linearize="set-point")
+        require_kind("controller", controller, RobotController)
+        sizes, needed = (controller.mpc.system.n, controller.mpc.system.m), (robot.n, robot.m)
+        if sizes != needed:
+            what = f"plans with {sizes} states and inputs"
+            fail("controller", what, f"This robot has {needed}: give one of its own")
         setting = cls(
             robot=robot,
             mpc=limited,
@@ -165,7 +168,7 @@ class RobotSetting:
             x0s=x0s,
             reference=reference,
             input_reference=inputs,
-            steps=max(1, round(seconds / robot.dt)),
+            steps=max(1, round(float(seconds) / robot.dt)),
             claim=claim,
         )
         if claim == "recursion":

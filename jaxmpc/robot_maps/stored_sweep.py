@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxmpc.arrays import Reals, host_array
 from jaxmpc.batches import Part, work_off
-from jaxmpc.checks import fail, whole
+from jaxmpc.checks import fail, positive, whole
 from jaxmpc.feasible.pipeline import Labels
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.stored import open_labels, stored_labels
@@ -108,9 +108,8 @@ def sweep_robot(
     if terminal == "ellipsoid":
         fail("terminal", "ellipsoid: a robot's limits are soft rows", "Give invariant or box")
     if steps is None:
-        if not 0 < seconds < np.inf:
-            fail("seconds", f"{seconds!r}", "Give a positive number")
-        steps = max(1, round(seconds / plant.dt))
+        positive("seconds", seconds)
+        steps = max(1, round(float(seconds) / plant.dt))
     config = {
         "robot": robot,
         "claim": claim,

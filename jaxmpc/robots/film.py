@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from jaxmpc.arrays import Reals, host_array
-from jaxmpc.checks import fail, require_finite, require_shape, whole
+from jaxmpc.checks import fail, positive, require_finite, require_shape, whole
 from jaxmpc.pytrees import record
 from jaxmpc.robots.description import host_coordinates
 from jaxmpc.robots.mujoco_access import mujoco, number_of
@@ -361,8 +361,7 @@ def check_frames(frames: Any, fps: float) -> None:
     if frames.ndim != 4 or frames.shape[-1] != 3 or frames.dtype != np.uint8 or not frames.size:
         problem = f"shape {frames.shape}, {frames.dtype}"
         fail("frames", problem, "Give (frames, height, width, 3), uint8")
-    if not 0 < fps < np.inf:
-        fail("fps", f"{fps}", "Give a positive number")
+    positive("fps", fps)
 
 
 def write_gif(file: Any, frames: np.ndarray, fps: float) -> None:

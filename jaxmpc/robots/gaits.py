@@ -24,7 +24,7 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.arrays import as_floats
-from jaxmpc.checks import concrete, fail, number, require_finite, require_kind, require_shape
+from jaxmpc.checks import concrete, fail, positive, require_finite, require_kind, require_shape
 from jaxmpc.pytrees import named_pytree, pytree, static
 from jaxmpc.qp.jax_transformations import compiled_lightly
 from jaxmpc.qp.linalg import matmul
@@ -174,7 +174,7 @@ def gait(
     require_shape("turn", turn, (), "A number, in rad/s")
     require_finite("turn", turn)
     for name, value in (("period", period), ("lift", lift)):
-        number(name, value, np.finfo(float).tiny, "Give a positive number")
+        positive(name, value)
     if not 0 < duty < 1:
         fail("duty", f"{duty}", "Give a part of the period in (0, 1)")
     count = round(period / robot.dt)

@@ -13,6 +13,7 @@ from jaxmpc.checks import (
     concrete,
     fail,
     number,
+    positive,
     require_finite,
     require_kind,
     require_real,
@@ -93,7 +94,7 @@ class ClosedLoopLoss:
                 fail("band", f"{self.band}", "Give positive numbers")
             if np.ndim(self.band) > 1:
                 fail("band", f"shape {np.shape(self.band)}", "Give (n,), one number for each state")
-        number("softness", self.softness, np.finfo(np.float64).tiny, "Give a positive number")
+        positive("softness", self.softness)
 
     def __call__(self, run: Run) -> Array:
         """Return the loss of one run."""

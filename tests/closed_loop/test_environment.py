@@ -217,6 +217,10 @@ def test_bad_environments_are_named(environment):
         (lambda: Environment.of(robot, Q=[1.0, 5.0], R=[np.nan]), "R: holds NaN"),
         (lambda: environment.at(np.zeros(3)), r"x: shape \(3,\) where"),
         (lambda: environment.reset(0), "key: 0. Give a JAX key"),
+        (
+            lambda: environment.reset(jax.random.split(jax.random.key(0), 3)),
+            r"key: is an array of keys, shape \(3,\). Give one, or use jax.vmap",
+        ),
         (lambda: environment.step(state, np.zeros(2)), r"action: shape \(2,\) where \(1,\)"),
         (lambda: policy(np.zeros(3)), r"observation: shape \(3,\) where"),
     ):

@@ -226,6 +226,11 @@ def test_deviations_are_the_same_problem():
         ({"x0s": np.zeros((0, 1))}, "x0s"),
         ({"seconds": 0.0}, "seconds: 0.0"),
         ({"seconds": np.nan}, "seconds: nan"),
+        ({"seconds": np.inf}, "seconds: inf. Give a finite number"),
+        ({"seconds": "1"}, "seconds: '1' where real numbers"),
+        ({"search_seconds": np.nan}, "search_seconds: nan"),
+        ({"axes": 0}, "axes: 0 is not a list. Give state indices"),
+        ({"controller": "x"}, "controller: is a str. Give a jm.RobotController"),
         ({"claim": "both"}, "claim: 'both'"),
         ({"axes": (1,)}, "axes"),
         ({"fixed": np.zeros(3)}, "fixed"),
@@ -335,3 +340,9 @@ def test_what_is_no_map_is_named():
     with pytest.raises(ValueError, match="mpc.soft: has rows.*claim=.limits"):
         map_robot(robot, soft, np.zeros((1, 2)), claim="recursion")
     assert run("sweep --robot pendulum --grid 0 2 --seconds 0.1") == 2
+
+
+def test_controllers_of_other_plants_are_named():
+    (plant, mpc), other = linear(problems.scalar()), linear(problems.joint())
+    with pytest.raises(ValueError, match=r"controller: plans with \(2, 1\) states and inputs"):
+        map_robot(plant, mpc, np.zeros((3, 1)), controller=jm.RobotController(*other))
