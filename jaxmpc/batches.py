@@ -250,7 +250,7 @@ def over_devices(function: Callable, devices: Devices, batched: Sequence[bool]) 
 # Points a compiled program takes at once on a CPU: a step's data stay within the cache.
 CHUNK = 8192
 # Rows from which on a progress bar counts in thousands.
-MANY = 100_000
+MANY_ROWS = 100_000
 
 
 def default_chunk(numbers: float = 4096, most: int = 128 * CHUNK) -> int:
@@ -437,7 +437,7 @@ def work_off(
     """
     begun, timing = time.perf_counter(), Timing()
     hidden = None if progress is None else not progress
-    with tqdm(total=total, unit=f" {unit}", unit_scale=total >= MANY, disable=hidden) as bar:
+    with tqdm(total=total, unit=f" {unit}", unit_scale=total >= MANY_ROWS, disable=hidden) as bar:
         for part in parts:
             bar.set_postfix_str(sink(part) or "", refresh=False)
             bar.update(part.size)

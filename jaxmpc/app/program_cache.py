@@ -28,7 +28,7 @@ LIMIT = 2**28
 # Beginning of the name of a process's own folder.
 RUN = "jaxmpc-run-"
 # Seconds after which the folder of a process counts as left behind.
-LEFT = 14 * 86400.0
+LEFT_BEHIND = 14 * 86400.0
 
 
 def user_cache() -> Path:
@@ -99,7 +99,7 @@ def _begin(folder: Path) -> Path:
     """Make the folder of this process, with links to all entries of `folder` that are whole."""
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     for left in folder.glob(f"{RUN}*"):
-        if _age(left) > LEFT:
+        if _age(left) > LEFT_BEHIND:
             shutil.rmtree(left, ignore_errors=True)
     own = Path(tempfile.mkdtemp(prefix=RUN, dir=folder))
     total = 0

@@ -67,7 +67,7 @@ ZERO = 1e-11
 # Size of the window onto an unbounded set, relative to that of the rows' data.
 REACH = 64.0
 # How far outside the window vertices are looked for, relative to its size.
-FAR = 1e5
+FAR_OUTSIDE = 1e5
 
 
 @record
@@ -654,13 +654,13 @@ def cell(p: LeastDistanceForm, active: tuple[int, ...]) -> Cell | None:
 
 def far_vertices(p: LeastDistanceForm, active: tuple[int, ...]) -> np.ndarray:
     """Return the vertices (k, n) of the region of an active set, without the window, that lie
-    within `FAR` times its size."""
-    piece = active_piece(p, active, FAR)
+    within `FAR_OUTSIDE` times its size."""
+    piece = active_piece(p, active, FAR_OUTSIDE)
     assert piece is not None
     own = p.row[piece.which] != -2
-    body = interior(piece.H[own], piece.h[own], FAR)
+    body = interior(piece.H[own], piece.h[own], FAR_OUTSIDE)
     vertices = np.zeros((0, len(p.center))) if body is None else body[0]
-    return vertices[np.abs(vertices).max(axis=1, initial=0.0) < FAR / 10]
+    return vertices[np.abs(vertices).max(axis=1, initial=0.0) < FAR_OUTSIDE / 10]
 
 
 def interior(H: np.ndarray, h: np.ndarray, far: float = 2.0) -> tuple[np.ndarray, float] | None:

@@ -33,7 +33,7 @@ STARTS = 32
 PATIENCE = 20
 RAYS = 64
 # Relative rounding of rho_bar up to which a weight is called equal to it.
-ROUNDING = 1e-9
+RHO_ROUNDING = 1e-9
 # Row kinds that `soften` makes soft.
 SOFTENED = ("state", "output", "terminal")
 
@@ -216,9 +216,9 @@ def is_sufficient(mpc: MPC, value: float, exact: bool, rho: float | None) -> boo
         return None
     weights = np.concatenate(given)
     # Rows may have weights of their own: the least decides for, the greatest against.
-    if exact and weights.min() >= value * (1 - ROUNDING):
+    if exact and weights.min() >= value * (1 - RHO_ROUNDING):
         return True
-    return False if weights.max() < value * (1 - ROUNDING) else None
+    return False if weights.max() < value * (1 - RHO_ROUNDING) else None
 
 
 def row_in_words(row: Row, side: float) -> str:
@@ -388,7 +388,7 @@ class PenaltySearch:
                 return
             here = max(waiting, key=lambda active: waiting[active].value)
             worst = waiting[here]
-            stale = 0 if worst.value > best * (1 + ROUNDING) else stale + 1
+            stale = 0 if worst.value > best * (1 + RHO_ROUNDING) else stale + 1
             best = max(best, worst.value)
             left.add(here)
             for row in self._facets(here, worst):

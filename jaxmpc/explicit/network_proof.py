@@ -27,10 +27,10 @@ from jaxmpc.sets.polyhedra import TRIANGULATED, simplex_volumes, triangulation
 from jaxmpc.systems.system import LinearSystem, host_matrices
 
 # Simplices that a program takes at once.
-PART = 8192
+SIMPLICES_AT_ONCE = 8192
 # What half-spaces of length one, in units of the set's size, have to keep beside the roundings of
 # the bounds: those of whoever evaluates the network.
-MARGIN = 1e-9
+ROUNDINGS = 1e-9
 
 # Quantities (k,) over a simplex: M (k, n), t (k,), r (k,).
 Enclosure = tuple[Array, Array, Array]
@@ -118,12 +118,14 @@ def prove_network(
     A, B, c = host_matrices(system)
     with jax.enable_x64(True):
         last = H @ A, H @ B, H @ c - h
-        margin = MARGIN + rounding_bound((layers, (low, high), last), np.abs(vertices).max(axis=0))
+        margin = ROUNDINGS + rounding_bound(
+            (layers, (low, high), last), np.abs(vertices).max(axis=0)
+        )
         network64 = jax.tree.map(jnp.asarray, (layers, (low, high), last))
         bounds = jax.jit(jax.vmap(excess_bounds, (None, 0)))
         whole_volume, kept, broken, count = float(simplex_volumes(left).sum()), 0.0, 0.0, 0
         while len(left) and count + len(left) <= cells:
-            parts = each_part(lambda part: bounds(network64, part), left, PART)
+            parts = each_part(lambda part: bounds(network64, part), left, SIMPLICES_AT_ONCE)
             least, most = joined([part.result for part in parts])
             count += len(left)
             volume, proved, refuted = simplex_volumes(left), most <= -margin, least >= margin

@@ -35,7 +35,7 @@ OPTIMAL = 1e-6
 # [−1, 1]^n, up to which the regions must fill X_N.
 FILL = 1e-9
 # How far beyond a facet the region behind it is looked for, relative to the facet's region.
-STEPS = (1e-2, 1e-4, 1e-6)
+BEYOND_FACETS = (1e-2, 1e-4, 1e-6)
 # Rounds of the search from what is missing, and random points of X_N from which each starts again.
 REPAIRS, RESTARTS = 20, 50
 DIMENSIONS = 6
@@ -357,7 +357,7 @@ class RegionSearch:
         if any(c is not None and c.touches(middle) for c in reached):
             return
         # Several rows vanish on the facet at once: look just behind it.
-        for step in STEPS:
+        for step in BEYOND_FACETS:
             behind = self.visit(self.p.active(middle + step * here.radius * here.H[i]))
             if behind is not None and behind.touches(middle):
                 return

@@ -35,7 +35,7 @@ from jaxmpc.recursion.time_budget import Budget
 FACTORS = 2.0 ** np.array([0.0, -2, -1, -0.5, 0.5, 1, 2])
 ROUNDS = 4
 # Steps to begin with, and at most.
-FEWEST, MOST = 60, 1920
+FIRST_STEPS, MOST_STEPS = 60, 1920
 # Over-relaxation of plans under affine policies and tubes, which begin cold: with 1.9 two thirds of
 # the first hundred steps go to what each of them turns around.
 ALPHA_OF_POLICIES = 1.6
@@ -88,7 +88,7 @@ def choose_steps(
         rho, alpha = np.asarray(precise.factor.rho)[0], ADMM().alpha
         if isinstance(precise.condensed, PolicyCondensed):
             kinds, alpha = np.zeros(len(rho), int), ALPHA_OF_POLICIES
-        steps = FEWEST if iterations is None else iterations
+        steps = FIRST_STEPS if iterations is None else iterations
         say = Budget.of(np.inf, progress).say
         while True:
             say(f"{steps:,} iterations")
@@ -105,7 +105,7 @@ def choose_steps(
             say(f"and {found.reached:,} of the {found.solvable:,} that have a solution")
             if found.reached >= share * found.solvable:
                 return solver
-            if steps >= MOST:
+            if steps >= MOST_STEPS:
                 text = f"{steps:,} iterations solve {found.reached:,} of {found.solvable:,} plans"
                 cure = "Give more iterations=, accept less (share=), or see tune_solver"
                 warnings.warn(f"choose_steps: {text}, not {share:.0%}. {cure}", stacklevel=2)

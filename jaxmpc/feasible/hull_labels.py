@@ -47,7 +47,7 @@ GAP, USEFUL, ROUNDS, MOST_RAYS = 1e-9, 0.05, 8, 200
 # Points of two coordinates that take longer by the other stages than the rays do, on a CPU and
 # elsewhere; each further coordinate takes four times as many. (One joint, N = 20, H100: 131,072
 # points 42 ms by the other stages, 88 by rays; 262,144 66 and 90; 1,048,576 136 and 136.)
-MANY, MANY_ELSEWHERE = 2**14, 2**19
+MANY_POINTS, MANY_POINTS_ELSEWHERE = 2**14, 2**19
 
 
 @pytree
@@ -187,7 +187,7 @@ def vertex_values(
 def hull_for(problem: FeasibilityProblem, points: float) -> Hull | None:
     """Return the hull of a problem if so many points are worth the rays, or if they were made for
     it before; None else, and where it has none."""
-    many = MANY if default_platform() == "cpu" else MANY_ELSEWHERE
+    many = MANY_POINTS if default_platform() == "cpu" else MANY_POINTS_ELSEWHERE
     least = many * 4.0 ** (problem.dimension - 2)
     if "hull" not in problem.memory and points >= least:
         problem.memory["hull"] = Hull.of(problem)

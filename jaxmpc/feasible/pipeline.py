@@ -70,13 +70,13 @@ LONGER = 20
 # some tens of milliseconds.
 MOST_PROGRAMS, MOST_ENTRIES = 2000, 2 * 10**7
 # Points that a hull leaves undecided which go on at once: they are few.
-LEFT = 4096
+FEW_LEFT = 4096
 # Proofs of up to so many bytes in total stay on the device until they are used.
 ON_DEVICE = 2**31
 # Points that a program takes at least: compiling takes far longer than what is computed in vain.
-FEWEST = 64
+LEAST_POINTS = 64
 # Number of points from which their typical size is taken.
-SAMPLE = 4096
+SIZE_SAMPLE = 4096
 # Parts that are submitted and not yet joined, at most: enough for some hundred workers.
 IN_FLIGHT = 256
 # How often a part is submitted again whose worker died.
@@ -294,7 +294,7 @@ class Scope:
         at zero, for problems whose bounding box is known (`FeasibilityProblem.exact`).
         """
         largest = extent_of(points) if extent else np.zeros(points.shape[1])
-        sample = points[:: max(1, len(points) // SAMPLE)]
+        sample = points[:: max(1, len(points) // SIZE_SAMPLE)]
         sample = np.abs(sample[np.all(np.isfinite(sample), axis=1)])
         size = np.median(sample, axis=0) if len(sample) else np.zeros(points.shape[1])
         return cls(largest, size, parts, before + len(points))
@@ -355,12 +355,12 @@ class Pipeline:
         self.share = -(-programs // max(scope.parts, 1))
         # A power of two where it is small, so that maps of some points more compile nothing; and
         # as the devices share it.
-        few = max(FEWEST, 1 << (chunk - 1).bit_length())
+        few = max(LEAST_POINTS, 1 << (chunk - 1).bit_length())
         self.whole = divisible(few if chunk < CHUNK else chunk, self.devices)
         each = gather_size(self.whole // count(self.devices))
         hull = hull_for(problem, scope.points)
         if hull is not None:
-            each = min(each, LEFT)
+            each = min(each, FEW_LEFT)
         self.batch = count(self.devices) * each
         self.short = compiled_admm(iterations, np.dtype(dtype), self.devices)
         self.long = compiled_admm(LONGER * iterations, np.dtype(np.float64), self.devices)

@@ -55,7 +55,7 @@ from jaxmpc.qp.linalg import by_step, namespace
 
 UNIT_ROUNDOFF = 2.0**-53
 # Covers products that underflow; data smaller than this count as zero.
-TINY = 1e-290
+UNDERFLOWS = 1e-290
 
 
 @pytree
@@ -161,7 +161,10 @@ def roll_out(p: ExactData, x: Array, inputs: Array, moved: Array) -> tuple[Array
         moving = (v != 0).astype(v.dtype)
         scaled = jnp.where((M == 0) | (jnp.abs(M) == 1), 0.0, 1.0) @ moving
         copied = (c == 0) & (scaled == 0) & ((M != 0).astype(v.dtype) @ moving <= 1)
-        growth, tiny = jnp.where(copied, 0.0, 2 * gamma(n + m + 2)), jnp.where(copied, 0.0, TINY)
+        growth, tiny = (
+            jnp.where(copied, 0.0, 2 * gamma(n + m + 2)),
+            jnp.where(copied, 0.0, UNDERFLOWS),
+        )
         bound = jnp.abs(A) @ jnp.abs(x) + jnp.abs(B) @ jnp.abs(u) + jnp.abs(c)
         error = jnp.abs(A) @ error + jnp.abs(B) @ u_error
         error = error * (1 + 1e-9) + growth * bound + tiny
@@ -257,7 +260,7 @@ def cut(p: ExactData, y_states: Array, y_N: Array, y_ball: Array) -> Cut:
     elif len(others):
         fixed = p.view.fixed[others]
         total, size = total - p_0[others] @ fixed, size + moved[others] @ jnp.abs(fixed)
-    a, b, w = p_0[axes], total + unit * size + TINY, unit * moved[axes]
+    a, b, w = p_0[axes], total + unit * size + UNDERFLOWS, unit * moved[axes]
     # 0'θ ≤ b excludes nothing, unless b < 0: then no θ at all is feasible.
     return Cut(a, jnp.where(jnp.isfinite(b) & (jnp.any(a != 0) | (b < 0)), b, jnp.inf), w)
 

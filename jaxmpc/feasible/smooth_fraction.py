@@ -31,11 +31,11 @@ from jaxmpc.qp.newton import Augmented, Constants, gram, newton_step, ridged
 from jaxmpc.qp.problem import Bounds
 
 # Newton steps at most: most states need 3 to 20.
-STEPS = 60
+MOST_STEPS = 60
 
 
 def feasible_fraction(
-    mpc: MPC, x0s: Reals, width: float = 0.02, *, scale: Any = None, newton_steps: int = STEPS
+    mpc: MPC, x0s: Reals, width: float = 0.02, *, scale: Any = None, newton_steps: int = MOST_STEPS
 ) -> Array:
     """Return the smoothed fraction of states x0s (B, n) from which hard constraints can be kept.
 
@@ -52,7 +52,7 @@ def feasible_fraction(
 
 
 def membership(
-    mpc: MPC, x0s: Any, width: Any = 0.02, *, scale: Any = None, newton_steps: int = STEPS
+    mpc: MPC, x0s: Any, width: Any = 0.02, *, scale: Any = None, newton_steps: int = MOST_STEPS
 ) -> Array:
     """Return 1/(1 + (δ/width)²) for each of the states x0s (B, n): (B,), between 0 and 1.
 

@@ -67,9 +67,9 @@ TAKEN |= {"policy_state", "policy_plan", "policy_answer"}
 MOST_NAME = 100
 # Points proved feasible, or half-spaces, from which on they are reduced to those that matter to the
 # bounds, and the most mapped states with which they are. To drop others makes no bound wrong.
-MANY, REDUCED = 10_000, 4
+MANY_ROWS, MOST_REDUCED = 10_000, 4
 # Half-spaces that cut nothing off within so many sizes of the grid around it do not matter.
-FAR = 100.0
+FAR_SIZES = 100.0
 
 
 class Picture(NamedTuple):
@@ -131,7 +131,7 @@ class StoredMap:
         cls, problem: FeasibilityProblem, store: Store, along: Sequence[np.ndarray]
     ) -> "StoredMap":
         """Read all labels of an open store, and the proofs that matter, block by block: memory does
-        not grow with the grid up to `REDUCED` mapped states."""
+        not grow with the grid up to `MOST_REDUCED` mapped states."""
         found = cls.unread(problem, store, along)
         points = found.bounds.bound_point
         cuts = HalfSpaces.none(np.array([[line[0], line[-1]] for line in along]).T)
@@ -143,7 +143,7 @@ class StoredMap:
             ends = line_ends(labels.label == 1, store.regions[block][-1])
             if len(ends):
                 points = np.concatenate([points, mesh(along, store.samples(block)[ends])])
-                points = extreme(points) if len(points) > MANY else points
+                points = extreme(points) if len(points) > MANY_ROWS else points
             if np.any(labels.label == -1):
                 cuts = cuts.add(store.read("cut_normal", block), store.read("cut_offset", block))
         return found._with_bounds(points, cuts.normals, cuts.offsets)
@@ -489,11 +489,11 @@ def line_ends(flags: np.ndarray, last: slice) -> np.ndarray:
 
 def extreme(points: np.ndarray) -> np.ndarray:
     """Return those of the points (K, d) that span their hull; all where that is flat, and above
-    `REDUCED` dimensions."""
+    `MOST_REDUCED` dimensions."""
     size, d = np.ptp(points, axis=0), points.shape[1]
     if d == 1:
         return points[[np.argmin(points), np.argmax(points)]]
-    if d > REDUCED or not size.all():
+    if d > MOST_REDUCED or not size.all():
         return points
     try:
         hull, kept = convex_hull((points - points.mean(axis=0)) / size)
@@ -519,7 +519,7 @@ class HalfSpaces:
     @classmethod
     def none(cls, ends: np.ndarray) -> "HalfSpaces":
         """Return no half-spaces. ends (2, d): of the grid."""
-        far = FAR * np.ptp(ends, axis=0)
+        far = FAR_SIZES * np.ptp(ends, axis=0)
         return cls(np.zeros((0, len(far))), np.zeros(0), ends + np.array([-far, far]))
 
     def add(self, normals: np.ndarray, offsets: np.ndarray) -> "HalfSpaces":
@@ -544,11 +544,11 @@ class HalfSpaces:
             normals=np.concatenate([self.normals, normals[first]]),
             offsets=np.concatenate([self.offsets, offsets[first]]),
         )
-        return found.reduced() if len(found.offsets) > MANY else found
+        return found.reduced() if len(found.offsets) > MANY_ROWS else found
 
     def reduced(self) -> "HalfSpaces":
         """Return those that bound the intersection; the first ones where it is empty or flat."""
-        if self.normals.shape[1] > REDUCED:
+        if self.normals.shape[1] > MOST_REDUCED:
             return self
         unit = power_of_two(np.ptp(self.around, axis=0))
         names = tuple(map(str, range(len(self.offsets))))
@@ -558,7 +558,7 @@ class HalfSpaces:
             body = body.require_body().reduce()
             index, vertices = [int(name) for name in body.labels if name], body.vertices() * unit
         except ValueError:
-            index, vertices = list(range(min(len(names), MANY))), None
+            index, vertices = list(range(min(len(names), MANY_ROWS))), None
         return replace(
             self, normals=self.normals[index], offsets=self.offsets[index], vertices=vertices
         )

@@ -50,15 +50,15 @@ from jaxmpc.sets.convex_sets import Polytope
 CHAINS, TRIAL = 4096, 512
 # Steps between two points of a chain that are kept, for each coordinate. A step takes 1/d of what a
 # coordinate has left of its start: e^-6 after so many.
-STEPS = 6
+STEPS_BETWEEN = 6
 # Random directions that all chains draw from; the products with the rows are made once.
 DIRECTIONS = 4096
 # Trials until so many points lie in X_N, each followed by rays through those that do not.
 TRIALS, ENOUGH, RAYS = 24, 0.9, 200
 # The hull of rays is the set if what it lacks is no more than this fraction of the volume.
-EXACT = 1e-7
+MISSING_VOLUME = 1e-7
 # Points that are drawn at once.
-PART = 2**20
+POINTS_AT_ONCE = 2**20
 
 
 @record
@@ -216,7 +216,7 @@ def drawn(
         if tried > 1000 and share < 1e-3:
             what = f"{kept} of {tried} points are proved feasible"
             fail("mpc", what, "Scale states and inputs, or give more iterations")
-        wanted = min(int((count - kept) / share * 1.01) + 16, PART)
+        wanted = min(int((count - kept) / share * 1.01) + 16, POINTS_AT_ONCE)
         x = source.draw(wanted, random)
         found = map_points(problem, x, **settings).labels
         inside = np.flatnonzero(found.label == 1)
@@ -256,7 +256,7 @@ class Cones(NamedTuple):
         """Return the cones of the hull that rays have found, None where it is not all of the
         set."""
         hull = hull_for(problem, np.inf)
-        if hull is None or not hull.gap <= EXACT:
+        if hull is None or not hull.gap <= MISSING_VOLUME:
             return None
         return cls.in_hull(hull)
 
@@ -328,13 +328,13 @@ class Chains:
         """Return chains that have forgotten their start, in half-spaces among which most points lie
         in the feasible set."""
         problem, d = rays.problem, rays.problem.dimension
-        steps = STEPS * d if steps is None else steps
+        steps = STEPS_BETWEEN * d if steps is None else steps
         box = rays.box()
         bounds = Bounds(box.normals, box.offsets).with_rays(
             rays.cast(of_length_one(random.standard_normal((8 * d, d))))
         )
         for _ in range(TRIALS):
-            trial = cls(rays.center, *bounds, STEPS * d, TRIAL)
+            trial = cls(rays.center, *bounds, STEPS_BETWEEN * d, TRIAL)
             trial.settle(random)
             x = trial.draw(TRIAL, random)
             inside = map_points(problem, x, **{**settings, "chunk": TRIAL}).label == 1
@@ -350,11 +350,11 @@ class Chains:
         own spread gives: three times, each in better ones."""
         d = len(self.center)
         for _ in range(3):
-            self.run(4 * STEPS * d, random)
+            self.run(4 * STEPS_BETWEEN * d, random)
             spread = np.linalg.cholesky(np.cov((self.y @ self.shape.T).T).reshape(d, d))
             self.y = np.linalg.solve(spread, self.shape @ self.y.T).T
             self.shape = spread
-        self.run(2 * STEPS * d, random)
+        self.run(2 * STEPS_BETWEEN * d, random)
 
     def run(self, steps: int, random: np.random.Generator) -> None:
         """Take steps in all chains."""

@@ -78,9 +78,9 @@ T = TypeVar("T")
 
 # Seconds of one core that a plan takes, over (rows + variables)³, measured for 1,600 to 6,000 of
 # them; and seconds that are told beforehand.
-SECONDS, LONG = 2e-10, 10.0
+SECONDS_A_CUBE, LONG_SECONDS = 2e-10, 10.0
 # Roundings of float32 that a plan, computed in float64 and then rounded, may be off.
-ROUNDED = 1000
+PLAN_ROUNDINGS = 1000
 
 
 @prepared_pytree
@@ -251,8 +251,8 @@ def _look_at_size(mpc: MPC, rows: int, variables: int) -> None:
     if mpc.disturbance is not None and mpc.policy == "tube":
         cure = "Give fewer steps, or a gain that damps faster, whose tube has fewer variables"
     require_memory(what, 8.0 * MATRICES * size**2, cure)
-    seconds = SECONDS * float(size) ** 3
-    if seconds > LONG and default_platform() == "cpu":
+    seconds = SECONDS_A_CUBE * float(size) ** 3
+    if seconds > LONG_SECONDS and default_platform() == "cpu":
         warnings.warn(f"{what}: a plan takes some {seconds:,.0f} s. {cure}", stacklevel=4)
 
 
@@ -467,7 +467,7 @@ def plan_of_solution(
         )
         solved = measured.within_tolerance
     else:
-        allowed = eps + ROUNDED * jnp.finfo(dtype).eps
+        allowed = eps + PLAN_ROUNDINGS * jnp.finfo(dtype).eps
         solved = (found.status == Status.SOLVED) & (worst(terms[:1], allowed)[1][0] <= allowed)
     lost = jnp.where(found.status == Status.SOLVED, Status.INACCURATE, found.status)
     found = replace(found, status=jnp.where(solved, Status.SOLVED, lost).astype(jnp.int32))

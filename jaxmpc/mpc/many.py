@@ -61,16 +61,16 @@ from jaxmpc.qp.solve import from_multipliers
 from jaxmpc.qp.status import Status
 
 # States from which on transfer is tried: below, compiling its programs costs more than it saves.
-MANY = 32_768
+MANY_STATES = 32_768
 # Of chunks so many or more, one is tried before all others; where fewer than this fraction of those
 # that can be solved are by following, solving takes less time.
-TRIAL, LEAST = 16, 0.3
+TRIAL_CHUNKS, LEAST_FOLLOWED = 16, 0.3
 # Coordinates of a state up to which its neighbours are near enough.
 MOST_COORDINATES = 4
 # One state in so many is solved first.
 STATES_A_CELL = 128
 # States among which those are chosen, for each of them, and states that the quantiles are of.
-CHOICE, SAMPLE = 4, 4096
+CHOICE, QUANTILE_STATES = 4, 4096
 # Multipliers relative to the largest that count as zero.
 INACTIVE = 1e-9
 
@@ -182,7 +182,13 @@ class Batch:
         left = np.arange(B)
         # (On GPUs the solver's kernels take less time than the laws and the host's indices would.)
         on_cpu = default_platform() == "cpu"
-        if transfer and self.to_host and on_cpu and B >= MANY and transferable(self.given[0]):
+        if (
+            transfer
+            and self.to_host
+            and on_cpu
+            and B >= MANY_STATES
+            and transferable(self.given[0])
+        ):
             left = self._transfer()
         self._run(_plans(self.devices), self.given, left)
         assert self.answer is not None
@@ -197,11 +203,11 @@ class Batch:
         laws = laws_of(*self.given, solved.multipliers, solved.status)
         arguments = (*self.given, laws, cells)
         left = np.delete(np.arange(len(self.x)), index)
-        if len(left) >= TRIAL * self.chunk:
+        if len(left) >= TRIAL_CHUNKS * self.chunk:
             few = np.random.default_rng(0).choice(left, self.chunk, replace=False)
             self._run(_follow(self.devices), arguments, few)
             solvable = 1 - np.mean(self._unsolved(index))
-            if 1 - np.mean(self._unsolved(few)) < LEAST * solvable:
+            if 1 - np.mean(self._unsolved(few)) < LEAST_FOLLOWED * solvable:
                 return left
         # All states, for those that are next to each other are copied faster.
         every = np.arange(len(self.x))
@@ -404,7 +410,7 @@ def choose(x: Any) -> tuple[np.ndarray, Cells]:
     index, some = index[finite], some[finite]
     if not len(some):
         index, some = np.zeros(1, int), np.zeros((1, p))
-    few = np.random.default_rng(1).integers(0, len(some), SAMPLE)
+    few = np.random.default_rng(1).integers(0, len(some), QUANTILE_STATES)
     ordered = np.sort(some[few], axis=0)
     ends = ordered[np.linspace(0, len(ordered) - 1, g + 1).astype(int)]
     edges, width = ends[1:-1], np.diff(ends, axis=0)

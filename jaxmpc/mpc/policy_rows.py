@@ -52,12 +52,12 @@ from jaxmpc.sets.minimal_invariant import minimal_robust_invariant_set
 from jaxmpc.systems.riccati import require_stable
 from jaxmpc.systems.system import host_matrices
 
-# What stands for no bound of a variable.
-LARGE = 1e30
+# What stands for no bound of a variable, and for an inverse that there is not.
+HUGE = 1e30
 # Numbers that the solver holds for each of (rows + variables)², about.
 MATRICES = 4
 # Generators of a tube's cross-section from which on maps and polytopes take minutes.
-MANY = 300
+MANY_GENERATORS = 300
 
 
 @pytree
@@ -187,7 +187,7 @@ def tube_section(mpc: MPC) -> Zonotope:
     )
     section = found.to_zonotope()
     count = np.asarray(section.generators).shape[1]
-    if count > MANY:
+    if count > MANY_GENERATORS:
         what = f"'tube' with a cross-section of {count:,} generators, each of them a variable"
         cure = 'A gain that damps faster has fewer, policy="tightened" none'
         text = f"policy: {what}: plans take seconds, maps and polytopes minutes. {cure}"
@@ -271,7 +271,7 @@ def _input_sizes(mpc: MPC, dtype: DTypeLike) -> tuple[Array, Array] | None:
     if not isinstance(mpc.inputs, Box):
         return None
     lower, upper = (jnp.asarray(v, dtype) for v in (mpc.inputs.lower, mpc.inputs.upper))
-    large = lambda v: jnp.minimum(v, LARGE)  # no limit: a product with 0 stays 0
+    large = lambda v: jnp.minimum(v, HUGE)  # no limit: a product with 0 stays 0
     return large(jnp.maximum(jnp.abs(lower), jnp.abs(upper))), large((upper - lower) / 2)
 
 
@@ -314,7 +314,7 @@ def _affine(nominal: Condensed, each: Condensed, mpc: MPC) -> PolicyCondensed:
     extent, sizes = None, _input_sizes(mpc, dtype)
     if sizes is not None and p == g:
         # Σ_j |U_kj Γ| is at most half the width: of U_kj in units of w, then of M.
-        in_w = jnp.minimum(jnp.max(jnp.abs(_inverse(Gamma)), axis=0), LARGE)
+        in_w = jnp.minimum(jnp.max(jnp.abs(_inverse(Gamma)), axis=0), HUGE)
         most = jnp.tile(sizes[1], N)[:, None] * jnp.tile(in_w, N)
         back, ends = _plan_extent(
             each, sizes[0] + matmul(most, jnp.abs(jnp.tile(center, N))).reshape(N, m)
@@ -335,7 +335,7 @@ def _affine(nominal: Condensed, each: Condensed, mpc: MPC) -> PolicyCondensed:
             least = jnp.abs(reach[row, at, generator]) + matmul(jnp.abs(answers), plan)
             T, T_of_theta = jnp.where(soft, least, T), jnp.where(soft[:, None], 0.0, T_of_theta)
         extent = jnp.append(plan, T), jnp.concatenate([of_theta, T_of_theta])
-        extent = jax.lax.stop_gradient(jax.tree.map(lambda v: jnp.minimum(v, LARGE), extent))
+        extent = jax.lax.stop_gradient(jax.tree.map(lambda v: jnp.minimum(v, HUGE), extent))
     # T and M are as large as what moves a row by its width. The two rows of an entry of T share the
     # multiplier of that for whose sum it is.
     width, multiplier = scales_of_rows(nominal.P, G, d - nominal.lower, nominal.upper - d)
@@ -361,12 +361,12 @@ def _affine(nominal: Condensed, each: Condensed, mpc: MPC) -> PolicyCondensed:
 
 
 def _inverse(Gamma: Array) -> Array:
-    """Return the inverse of a square matrix, of a diagonal one entry by entry; `LARGE` where there
+    """Return the inverse of a square matrix, of a diagonal one entry by entry; `HUGE` where there
     is none."""
     entries = jnp.diag(Gamma)
     usual = jnp.where(entries != 0, 1 / jnp.where(entries != 0, entries, 1.0), 0.0)
     diagonal = jnp.all(Gamma == jnp.diag(entries))
-    other = jnp.nan_to_num(jnp.linalg.inv(Gamma), nan=LARGE, posinf=LARGE, neginf=-LARGE)
+    other = jnp.nan_to_num(jnp.linalg.inv(Gamma), nan=HUGE, posinf=HUGE, neginf=-HUGE)
     return jnp.where(diagonal, jnp.diag(usual), other)
 
 

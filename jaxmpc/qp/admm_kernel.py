@@ -18,10 +18,10 @@ from jax.typing import DTypeLike
 
 from jaxmpc.pytrees import record
 from jaxmpc.qp.admm import Factor
-from jaxmpc.qp.jax_transformations import LARGE
+from jaxmpc.qp.jax_transformations import LARGE_BATCH
 from jaxmpc.qp.kernel import (
     EXACT,
-    LEAST,
+    LEAST_SIDE,
     ROUGH,
     Product,
     Ref,
@@ -44,11 +44,11 @@ BYTES, MOST_BYTES = {ROUGH: 4, EXACT: 6}, 153_600
 
 
 def pieces(count: int) -> list[tuple[int, int]]:
-    """Return (first, size) of the pieces of `count` entries: at most two powers of two, LEAST at
-    least, with the smallest sum that holds them all."""
+    """Return (first, size) of the pieces of `count` entries: at most two powers of two, at least
+    LEAST_SIDE, with the smallest sum that holds them all."""
     whole = padded_side(count)
     small = padded_side(max(count - whole // 2, 1))
-    if whole == LEAST or small == whole // 2:
+    if whole == LEAST_SIDE or small == whole // 2:
         return [(0, whole)]
     return [(0, whole // 2), (whole // 2, small)]
 
@@ -90,7 +90,7 @@ def iterate_batch(
     columns, inner = row_pieces(m, balls), pieces(made.A.shape[1])
     low_rank = 2 * total(inner) < total(columns)
     # More instances a program where there are programs enough for all of the GPU's processors.
-    T = 64 if total(columns) <= 64 and B >= LARGE else LEAST
+    T = 64 if total(columns) <= 64 and B >= LARGE_BATCH else LEAST_SIDE
     times = functools.partial(dot, product=product)
 
     offsets = [-matmul(matmul(q, Minv), made.A.T) for Minv in made.Minv]

@@ -36,7 +36,7 @@ from jax import Array
 from jaxmpc.qp.admm import Factor, ScaledProgram
 from jaxmpc.qp.dual import KERNEL_ROWS, inverted, sides
 from jaxmpc.qp.jax_transformations import Undo, in_blocks, on_gpu, repeat_while, true_places
-from jaxmpc.qp.kernel import LEAST, Ref, call, gather, indices, load, store
+from jaxmpc.qp.kernel import LEAST_SIDE, Ref, call, gather, indices, load, store
 from jaxmpc.qp.linalg import definite_solver, matmul, precisely
 from jaxmpc.qp.newton import Constants, gram, ridged
 from jaxmpc.qp.problem import QP, Bounds
@@ -315,7 +315,7 @@ def _damped(rows: int, side: int, damping: float, steps: int, dtype: jnp.dtype) 
         y = jax.lax.cond(count > 0, solution, lambda _: jnp.zeros(side, dtype), jnp.int32(0))
         store(y_ref.at[k], y, k < rows)
 
-    warps = 1 if side <= LEAST else 4 if side <= 32 else 8
+    warps = 1 if side <= LEAST_SIDE else 4 if side <= 32 else 8
     program = call(damped_steps, jax.ShapeDtypeStruct((rows,), dtype), warps)
 
     def run(count: Array, S: Array, W: Array, Lambda: Array, b: Array) -> Array:

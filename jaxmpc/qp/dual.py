@@ -36,7 +36,17 @@ from jax import Array
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.admm import ScaledProgram
 from jaxmpc.qp.jax_transformations import has_kernels, repeat_while, tree_where, true_places
-from jaxmpc.qp.kernel import LEAST, Ref, barrier, call, gather, indices, load, padded_side, store
+from jaxmpc.qp.kernel import (
+    LEAST_SIDE,
+    Ref,
+    barrier,
+    call,
+    gather,
+    indices,
+    load,
+    padded_side,
+    store,
+)
 from jaxmpc.qp.linalg import infinity_norm, matmul, solve
 from jaxmpc.qp.problem import FREE, Bounds, sign
 from jaxmpc.qp.residuals import Pair
@@ -57,7 +67,7 @@ NOISE = 1e-13
 # Difference of losses, relative to these, that counts as none.
 TIE = 1e-13
 # Distance from the optimum at which the steps end that is rounding of the largest multiplier.
-ROUNDING = 1e-15
+DISTANCE_ROUNDING = 1e-15
 # Most steps, and most of a second search.
 MOST_STEPS, MORE_STEPS = 24, 100
 # Distance from the optimum at which the steps end, relative to the largest row.
@@ -264,7 +274,7 @@ def after_step(
     limit: that of the `Dual`. fits: whether all rows were in W. The count is `steps.first` where
     the search begins once more."""
     error, largest_v, largest_y = largest
-    optimal = error <= converged * (1 + largest_v) + ROUNDING * largest_y
+    optimal = error <= converged * (1 + largest_v) + DISTANCE_ROUNDING * largest_y
     # (Without "not": Triton's dialect lacks it for booleans.)
     lost = jnp.where(largest_y <= limit, jnp.where(fits, False, taken > JOINTLY), True)
     first = taken <= steps.first
@@ -525,7 +535,7 @@ def _search(dual: Dual, rows: int, side: int, steps: MostSteps, *, last: bool) -
     vectors = [(m, dtype), (m, dtype), (3, jnp.int32)]
     scratch = [(side, jnp.int32), (side, dtype), (m, dtype)]
     shapes = [jax.ShapeDtypeStruct((count,), kind) for count, kind in vectors + scratch]
-    warps = 1 if width <= 64 and side <= LEAST else 2 if side <= 32 and width <= 128 else 4
+    warps = 1 if width <= 64 and side <= LEAST_SIDE else 2 if side <= 32 and width <= 128 else 4
     program = call(dual_steps, shapes, warps)
 
     def run(limit: Array, cold: Array, flags: Array, y: Array, v: Array) -> tuple[Array, ...]:

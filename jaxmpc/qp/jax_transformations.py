@@ -68,22 +68,22 @@ RECURSION_CPU = 16
 # from far off, 30 % of them infeasible: 63 µs a state with 16, 48 with 32.)
 LEFT_CPU = 32
 # Instances in a group elsewhere: a quarter of the batch; when fewer are open a sixteenth of that,
-# and so on, but not below LEAST, where a step costs little more than its launches. (H100,
+# and so on, but not below LEAST_GROUP, where a step costs little more than its launches. (H100,
 # TurboMPC's problem, 4,096 at once: 2.6 µs a solve in one group, 1.6 in groups of 512, 1.2 of 1,024
 # and 256.) Of recursions over a horizon the whole batch, a quarter, and an eighth of that. (4,096
 # arms for 1 s: 1.31 s in groups of 4,096 and 256, 1.21 of 4,096, 1,024 and 128.)
-PART, SMALLER, LEAST = 4, 16, 256
+GROUP_PART, SMALLER, LEAST_GROUP = 4, 16, 256
 # Operations of a group's step there that take as long as its launches, where a step says how many
-# it has an instance: of those with many, smaller groups are worth it, of FEWEST at least.
-WORK, FEWEST = 2**30, 32
+# it has an instance: of those with many, smaller groups are worth it, of FEWEST_WORKING at least.
+LAUNCH_WORK, FEWEST_WORKING = 2**30, 32
 # Instances on a GPU from which on the arithmetic, not the launches, takes the time.
-LARGE = 16_384
+LARGE_BATCH = 16_384
 # Operations of a jaxpr that call a program once.
 CALLS = {"jit", "pjit", "closed_call", "custom_jvp_call", "custom_vmap_call", "remat"}
 # Length of masks from which on their true places are looked up.
-LONG = 65_536
+LONG_MASK = 65_536
 # Most rows that a kernel takes: a program's registers hold no more.
-MOST = 512
+MOST_KERNEL_ROWS = 512
 
 
 def own_modes(function: F) -> F:
@@ -244,7 +244,7 @@ def on_gpu() -> bool:
 
 def has_kernels(rows: int) -> bool:
     """Return whether programs run on such a GPU and kernels take so many rows."""
-    return on_gpu() and 0 < rows <= MOST
+    return on_gpu() and 0 < rows <= MOST_KERNEL_ROWS
 
 
 @functools.cache
@@ -284,12 +284,12 @@ def group_sizes(batch: int, steps: Steps = "short", work: int = 0) -> list[int]:
         if steps == "long" and batch > LONG_CPU:
             return [LONG_CPU, GROUP_CPU]
         return [min(batch, RECURSION_CPU if steps == "recursion" else GROUP_CPU)]
-    least = min(max(WORK // max(work, 1), FEWEST), LEAST)
-    if batch <= PART * least:
+    least = min(max(LAUNCH_WORK // max(work, 1), FEWEST_WORKING), LEAST_GROUP)
+    if batch <= GROUP_PART * least:
         return [batch]
     if steps == "recursion":
-        return [batch, -(-batch // PART), -(-batch // (8 * PART))]
-    sizes = [-(-batch // PART)]
+        return [batch, -(-batch // GROUP_PART), -(-batch // (8 * GROUP_PART))]
+    sizes = [-(-batch // GROUP_PART)]
     while sizes[-1] > least:
         sizes.append(max(-(-sizes[-1] // SMALLER), least))
     return sizes
@@ -668,7 +668,7 @@ def true_places(mask: Array, size: int) -> Array:
     off.)"""
     m = mask.shape[0]
     rank = jnp.cumsum(mask, dtype=jnp.int32) - 1
-    if m >= LONG:  # to look `size` of them up takes less than to put all m in their place
+    if m >= LONG_MASK:  # to look `size` of them up takes less than to put all m in their place
         wanted = jnp.arange(1, size + 1, dtype=jnp.int32)
         return jnp.searchsorted(rank + 1, wanted, method="scan_unrolled").astype(jnp.int32)
     place = jnp.where(mask, jnp.minimum(rank, size), size)

@@ -29,7 +29,7 @@ from jaxmpc.qp.jax_transformations import called_jaxpr, has_jax_triton, on_gpu
 from jaxmpc.qp.triton_source import triton_function, triton_source
 
 # Least side of a matrix in Triton's products.
-LEAST = 16
+LEAST_SIDE = 16
 # float32 products as sums of six products of bfloat16, as exact as float32's own, or of three, with
 # errors of 2⁻¹⁶.
 Product = lax.DotAlgorithmPreset
@@ -134,7 +134,7 @@ def call(kernel: Callable, shapes: Any, warps: int = 1, grid: int = 1) -> Callab
     return run
 
 
-def padded_side(n: int, least: int = LEAST) -> int:
+def padded_side(n: int, least: int = LEAST_SIDE) -> int:
     """Return the least power of two that holds n, at least `least`."""
     return max(1 << (n - 1).bit_length(), least)
 
@@ -151,7 +151,7 @@ def program() -> Array:
 
 def dot(a: Array, b: Array, product: Product) -> Array:
     """Return the product of two matrices; product: EXACT or ROUGH, for float32 on tensor cores."""
-    if min(*a.shape, *b.shape) < LEAST:
+    if min(*a.shape, *b.shape) < LEAST_SIDE:
         return jnp.sum(a.T[:, :, None] * b[:, None, :], axis=0)
     return lax.dot_general(
         a, b, (((1,), (0,)), ((), ())), precision=product, preferred_element_type=a.dtype

@@ -49,7 +49,7 @@ RAY = 25
 # about rounding.
 CANCELS = float(np.sqrt(np.finfo(np.float64).eps))
 # Least size: products of two numbers below it are zero.
-LEAST = float(np.sqrt(np.finfo(np.float64).tiny))
+LEAST_SIZE = float(np.sqrt(np.finfo(np.float64).tiny))
 # Entries of a Farkas vector or a ray, relative to the largest, that count as zero.
 INSIGNIFICANT = 1e-13
 # Rows that correct a certificate, and their entries: see `correcting_rows`.
@@ -149,13 +149,13 @@ def worst(terms: Terms, floor: float | Array) -> tuple[list[Array], list[Array]]
     the largest relative to size and terms; 0/0 is 0, and inf where one is not finite.
 
     Where all is zero at the solution, inputs, rows and multipliers, iterates come to it without
-    end: sizes are no less than `LEAST`."""
+    end: sizes are no less than `LEAST_SIZE`."""
     above, relative = [], []
     for values, sizes, own in terms:
         # A maximum need not propagate NaN (XLA on CPUs).
         sound = finite(values) & finite(sizes) & finite(own)
         error = jnp.where(sound, jnp.abs(values), jnp.inf)
-        least = LEAST if error.dtype == jnp.float64 else jnp.finfo(error.dtype).tiny
+        least = LEAST_SIZE if error.dtype == jnp.float64 else jnp.finfo(error.dtype).tiny
         size = jnp.where(sound, jnp.maximum(sizes, least), 1.0)
         total = jnp.where(sound, size + own, 1.0)
         above.append(jnp.max((error - floor * total) / size, initial=0.0))

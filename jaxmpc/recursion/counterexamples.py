@@ -30,7 +30,7 @@ STARTS = 96
 NOT_FEASIBLE, UNDECIDED = -1, -2
 # Gradient ascent: distance kept from the half-spaces (on the boundary only one plan is feasible,
 # and solvers converge slowly), and step lengths; relative to the size of the set.
-INSET = 1e-6
+INSET_OF_ASCENT = 1e-6
 LENGTHS = 0.3 * 0.5 ** np.arange(16)
 # Then the search goes from region to region: with how many states at once, in how many rounds, from
 # how many neighbours at what distance.
@@ -247,12 +247,12 @@ def ascend(law: Law, bound: CenteredPolytope, starts: np.ndarray, deadline: floa
     v. Then the best go from region to region, each to the maximum of a_j'x⁺ on its region. The
     method is local: that it finds no counterexample does not prove that there is none.
     """
-    x = bound.nearest(starts, INSET)
+    x = bound.nearest(starts, INSET_OF_ASCENT)
     value, gradient = _value_and_gradient(law, bound, x, deadline)
     for length in LENGTHS:
         if time.monotonic() > deadline:
             break
-        trial = bound.nearest(x + length * bound.unit * gradient, INSET)
+        trial = bound.nearest(x + length * bound.unit * gradient, INSET_OF_ASCENT)
         better, slope = _value_and_gradient(law, bound, trial, deadline, than=value)
         grown = better > value
         x[grown], value[grown], gradient[grown] = trial[grown], better[grown], slope[grown]
@@ -295,7 +295,7 @@ def _climb_regions(
         if time.monotonic() > deadline:
             break
         beside = random.standard_normal((NEIGHBOURS, *best.shape)) * NEAR * bound.unit
-        around = bound.nearest(np.concatenate([best, *(best + beside)]), INSET)
+        around = bound.nearest(np.concatenate([best, *(best + beside)]), INSET_OF_ASCENT)
         peaks, heights = _peaks(law, bound, around, deadline)
         states, values = np.concatenate([best, peaks]), np.append(top, heights)
         chosen: list[int] = []

@@ -17,7 +17,7 @@ from jaxmpc.checks import fail
 from jaxmpc.robots.mujoco_access import BALL, FREE
 
 # Below this angle² the series of sin and cos are exact in float64.
-SMALL = 1e-8
+SMALL_ANGLE = 1e-8
 
 
 class Block(NamedTuple):
@@ -120,7 +120,7 @@ def product(a: Array, b: Array) -> Array:
 def _exponential(w: Array) -> Array:
     """Return the quaternion of the rotation by |w| about w: (cos |w|/2, w sin(|w|/2)/|w|)."""
     squared = jnp.dot(w, w)
-    small = squared < SMALL
+    small = squared < SMALL_ANGLE
     angle = jnp.sqrt(jnp.where(small, 1.0, squared))  # no sqrt at 0: its derivative is infinite
     real = jnp.where(small, 1 - squared / 8, jnp.cos(angle / 2))
     ratio = jnp.where(small, 0.5 - squared / 48, jnp.sin(angle / 2) / angle)
@@ -132,7 +132,7 @@ def _logarithm(q: Array) -> Array:
     q = jnp.where(q[0] < 0, -q, q)
     v = q[1:]
     squared = jnp.dot(v, v)
-    small = squared < SMALL
+    small = squared < SMALL_ANGLE
     size = jnp.sqrt(jnp.where(small, 1.0, squared))
     # With w = √(1 − |v|²): 2 asin|v|/|v| = 2 + |v|²/3 + …
     return jnp.where(small, 2 + squared / 3, 2 * jnp.arctan2(size, q[0]) / size) * v

@@ -34,7 +34,7 @@ from jaxmpc.sets.convex_sets import Box
 # Step of central differences in ξ and u: of an affine function any step gives the derivative.
 STEP = 1e-4
 # Derivatives that count as rounding, relative to the largest of their row.
-ROUNDING = 1e-9
+DERIVATIVE_ROUNDING = 1e-9
 # Distances, as fractions of a joint's range, between which the parabola of stopping has its chords.
 DISTANCES = np.array([0.0, 1 / 64, 1 / 16, 1 / 4, 1.0])
 
@@ -83,7 +83,7 @@ def force_limits(robot: RobotDescription, x: Any, u: Any) -> ForceLimits | None:
             states = np.asarray(jax.vmap(robot.state)(states))
     after, before = np.split(np.array(list(map(forces, states, points[:, n:]))), 2)
     slope = (after - before).T / (2 * STEP)
-    slope[np.abs(slope) <= ROUNDING * np.abs(slope).max(axis=1, keepdims=True)] = 0.0
+    slope[np.abs(slope) <= DERIVATIVE_ROUNDING * np.abs(slope).max(axis=1, keepdims=True)] = 0.0
     shift = forces(np.asarray(x, float), np.asarray(u, float)) - slope @ about
     ranges = [
         model.actuator_forcerange[actuators],

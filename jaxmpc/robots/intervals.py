@@ -17,7 +17,7 @@ UNIT = 2.0**-52
 # What NumPy's sines and cosines may be off: its own tables say less than 4 of 2^-53.
 OFF = 2.0**-50
 # Beyond this the number of periods is not known well enough to look for maxima.
-FAR = 1e4
+FAR_ANGLE = 1e4
 
 
 @record
@@ -118,7 +118,7 @@ def _wave(a: Interval, wave: Any, shift: float) -> Interval:
     near = 1e-9
     first = np.ceil(a.lower / np.pi - shift - near)
     last = np.floor(a.upper / np.pi - shift + near)
-    far = np.maximum(np.abs(a.lower), np.abs(a.upper)) > FAR
+    far = np.maximum(np.abs(a.lower), np.abs(a.upper)) > FAR_ANGLE
     even = (2 * np.ceil(first / 2) <= last) | far
     odd = (2 * np.ceil((first - 1) / 2) + 1 <= last) | far
     lower = np.where(odd, -1.0, np.maximum(np.minimum(*ends) - OFF, -1.0))

@@ -47,7 +47,7 @@ NONNEGATIVE = (*INERTIAS, *FRICTIONS)
 # Fields for whose zeros in the file a program has no force.
 ABSENT_AT_ZERO = (*FRICTIONS, "body_gravcomp")
 # In place of zero: a row of dry friction whose bound is zero is an equality to MJX, and locks.
-TINY = 1e-30
+NO_FRICTION = 1e-30
 # Fields from which `load_robot` makes limits of inputs, in place of limits of the plant's forces.
 OF_LIMITS = ("actuator_gear", "actuator_gainprm", "actuator_forcerange", "jnt_actfrcrange")
 
@@ -113,7 +113,7 @@ def acting_fields(
     for name in names.intersection(ABSENT_AT_ZERO):
         value = getattr(model, name)
         if np.any(value == 0) and (name != "body_gravcomp" or not np.any(value)):
-            fields[name] = np.maximum(value, TINY)
+            fields[name] = np.maximum(value, NO_FRICTION)
     if "body_gravcomp" in fields:
         fields["flg_gravcomp"] = True
     if names.intersection(OF_LIMITS):

@@ -18,7 +18,7 @@ from jaxmpc.qp.linalg import matmul, solve, stand_ins
 from jaxmpc.robots.configurations import normalised, rates, retract
 from jaxmpc.robots.jaxpr_rewriting import in_pieces, moving, rewritten, with_forward_jacobian
 from jaxmpc.robots.mujoco_access import BALL, mjx_module, mujoco
-from jaxmpc.robots.parameters import DIRECTIONS, FRICTIONS, PAYLOAD, TINY, acting_fields
+from jaxmpc.robots.parameters import DIRECTIONS, FRICTIONS, NO_FRICTION, PAYLOAD, acting_fields
 from jaxmpc.robots.rigid_bodies import (
     FIELDS,
     Tree,
@@ -254,7 +254,7 @@ class Physics:
         # A copy for each program. JAX caches by identity how it converted NumPy arrays, also for
         # programs of the other precision, and MJX passes it arrays of the model.
         of_model = {key: value for key, value in numbers.items() if hasattr(self.mjx, key)}
-        of_model |= {key: v + TINY for key, v in of_model.items() if key in FRICTIONS}
+        of_model |= {key: v + NO_FRICTION for key, v in of_model.items() if key in FRICTIONS}
         model = copy.deepcopy(self.mjx).replace(**of_model)
         model = cast(model.replace(**_without_margins(model)))
         data = cast(mjx.make_data(self.model, impl="jax")).replace(qpos=q, qvel=v, act=act, ctrl=u)

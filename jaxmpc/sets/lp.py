@@ -22,7 +22,7 @@ from jaxmpc.checks import fail
 
 # Entries of scaled rows that are smaller count as zeros: in HiGHS below 1e-9 unless told otherwise,
 # and this is the least that it takes.
-SMALL = 1e-12
+SMALL_ENTRY = 1e-12
 # Options of HiGHS: tolerances in rows and columns that are scaled to about 1. Its presolve calls
 # some unbounded programs infeasible and needs scaling of its own, so it is off.
 HIGHS = {
@@ -30,18 +30,18 @@ HIGHS = {
     "presolve": "off",
     "primal_feasibility_tolerance": 1e-10,
     "dual_feasibility_tolerance": 1e-10,
-    "small_matrix_value": SMALL,
+    "small_matrix_value": SMALL_ENTRY,
 }
 METHODS = "simplex", "ipm"
 # By how much an answer of HiGHS may violate scaled rows, well above its tolerance.
-KEPT = 1e-7
+MOST_VIOLATION = 1e-7
 # A set is flat if its rows keep no larger common margin, relative to its own size.
 FLAT = 1e-9
 # A sum within this of the sum of its terms' sizes is rounding: well above 2^-53, since the data are
 # results of long computations.
 ROUNDING = 1e-11
 # What is left of G'y in a Farkas vector is charged for points so many times as far as typical ones.
-FAR = 1e3
+FARTHEST = 1e3
 # Sides of rows that are smaller are zeros.
 UNDERFLOW = 1e-250
 _SWEEPS = 40  # of the least squares of `scaling`; fewer where they end before
@@ -224,10 +224,10 @@ class Program:
         return None, claim
 
     def _within(self, x: np.ndarray) -> bool:
-        """Return whether x keeps the scaled rows to KEPT, of their terms where these are above 1:
-        bounds of 1e20 that mean none have others."""
+        """Return whether x keeps the scaled rows to MOST_VIOLATION, of their terms where these are
+        above 1: bounds of 1e20 that mean none have others."""
         terms = np.maximum(np.abs(self.M) @ np.abs(x), np.abs(self.b))
-        return bool(np.all(self._excess(x) <= KEPT * (1 + terms)))
+        return bool(np.all(self._excess(x) <= MOST_VIOLATION * (1 + terms)))
 
     def _excess(self, x: np.ndarray) -> np.ndarray:
         """Return by how much x violates each of the scaled rows."""
@@ -315,7 +315,7 @@ class Program:
             if np.any((v < 0) & ~self.equal):
                 continue
             # |x| of about 1 is typical in scaled coordinates; the point found may lie farther out.
-            far = FAR * (1 + np.abs(x))
+            far = FARTHEST * (1 + np.abs(x))
             size = np.abs(v) @ (np.abs(self.b) + np.abs(self.M) @ (1 + np.abs(x)))
             if -self.b @ v > np.abs(self.M.T @ v) @ far + ROUNDING * size:
                 return v * self.row
@@ -331,7 +331,7 @@ class Program:
         model = Model(box, limits, equal)
         # Rows of about 1 that let a point go 1e12 times as far as it typically does are no limits;
         # HiGHS takes their entries for zeros.
-        M = np.where(np.abs(self.M) < SMALL, 0.0, self.M)
+        M = np.where(np.abs(self.M) < SMALL_ENTRY, 0.0, self.M)
         for method in METHODS:
             found, _ = model.maximise(cost, method)
             if found is None:

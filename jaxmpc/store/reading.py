@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     import xarray as xr
     import zarr
 
-# Most blocks of a store that is read. Its data are no larger than SMALL bytes, or so many times its
-# files: a sweep's are some 13 times as large, one number throughout is far more.
-MOST_BLOCKS, SMALL, MOST_COMPRESSED = 2**17, 2**28, 1000
+# Most blocks of a store that is read. Its data are no larger than SMALL_STORE bytes, or so many
+# times its files: a sweep's are some 13 times as large, one number throughout is far more.
+MOST_BLOCKS, SMALL_STORE, MOST_COMPRESSED = 2**17, 2**28, 1000
 
 # What looks at attributes and axes before data are read, and returns what is wrong with them.
 Check: TypeAlias = Callable[[Mapping[str, Any], Mapping[str, np.ndarray]], list[str]]
@@ -343,7 +343,7 @@ def _described(
             fail(name, what, "Overwrite the store")
     needed = sum(math.prod(v.shape) * v.itemsize for v in sizes.values())
     there = needed if isinstance(path, str) else _stored_bytes(path)
-    if needed > max(SMALL, MOST_COMPRESSED * there):
+    if needed > max(SMALL_STORE, MOST_COMPRESSED * there):
         what = f"describes {in_units(needed)} of data, its files hold {in_units(there)}"
         fail("zarr.json", what, "Overwrite it")
     kept = [name for name in sizes if keep is None or name in keep or name not in fields]

@@ -12,7 +12,7 @@ from jax import Array
 from jaxmpc.arrays import Reals
 from jaxmpc.batches import chosen_devices
 from jaxmpc.checks import fail
-from jaxmpc.feasible.smooth_fraction import STEPS, membership
+from jaxmpc.feasible.smooth_fraction import MOST_STEPS, membership
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.linalg import arrays
 from jaxmpc.tuning.batch_mean import BatchMean
@@ -28,7 +28,7 @@ def tune_feasible_set(
     width: float = 0.02,
     *,
     design_loss: Callable[[MPC], Any] | None = None,
-    newton_steps: int = STEPS,
+    newton_steps: int = MOST_STEPS,
     **settings: Any,
 ) -> TuningRun:
     """Enlarge the feasible set by gradient: min_θ design_loss(mpc) − feasible_fraction(mpc, x0s).

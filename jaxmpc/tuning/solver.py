@@ -49,13 +49,13 @@ VERSION = 5
 # Constant penalties that are tried as a start, with this over-relaxation.
 CONSTANTS, ALPHA = np.logspace(-2, 2, 9), 1.6
 # Fewest states to learn from, validation included, and for validation.
-FEWEST, FEWEST_VALIDATION = 8, 2
+LEAST_STATES, LEAST_VALIDATION = 8, 2
 # Learning rate of log rho at the start: rho may be wrong by decades there. How often the validation
 # set is solved, which costs as much as many steps.
 RATE, VALIDATIONS = 0.2, 15
-SOLVER = ADMM(newton_steps=0)
+ADMM_ALONE = ADMM(newton_steps=0)
 # Digits by which the loss wants residuals below their tolerance.
-MARGIN = 0.3
+DIGITS_BELOW = 0.3
 # Values of a group along the horizon, between which log rho is interpolated.
 KNOTS = 5
 
@@ -110,7 +110,7 @@ def tune_solver(
         fail("warm_start", f"{shown(warm_start)} is none of them", cure)
     for part in warm_start if isinstance(warm_start, tuple | list) else ():
         require_real("warm_start", part)
-    solver = SOLVER if solver is None else solver
+    solver = ADMM_ALONE if solver is None else solver
     references = reference, input_reference
     objective = _objective(mpc, iterations, stages, groups, solver, references)
     train, test = _samples(objective.controller, x0s, warm_start, chosen)
@@ -305,14 +305,14 @@ def _samples(
     """Return the samples for training and for validation; ValueError for bad input."""
     mpc = controller.mpc
     x = _states(mpc, "x0s", x0s)
-    if len(x) < FEWEST:
-        fail("x0s", f"{len(x)} states", f"Give at least {FEWEST}, better some hundred")
+    if len(x) < LEAST_STATES:
+        fail("x0s", f"{len(x)} states", f"Give at least {LEAST_STATES}, better some hundred")
     if warm_start is not None:
         with jax.enable_x64(True):
             warm_start = _warm_starts(controller, x, warm_start)
     samples = Samples(x, warm_start)
     if settings.splits:
-        return settings.split(samples, FEWEST_VALIDATION, shuffle=True)
+        return settings.split(samples, LEAST_VALIDATION, shuffle=True)
     if warm_start is not None:
         fail("validation", "given as states beside warm starts", "Give a fraction in (0, 1)")
     return samples, Samples(_states(mpc, "validation", settings.validation))
@@ -402,7 +402,7 @@ def loss_and_gradient(devices: Devices = None) -> BatchMean:
 
     def loss(theta: Any, objective: PenaltyObjective, samples: Samples, weights: Array) -> Array:
         e = objective.digits(theta, samples)
-        return jnp.sum(weights * jax.nn.softplus(2 * (e + MARGIN)) / 2) / jnp.sum(weights)
+        return jnp.sum(weights * jax.nn.softplus(2 * (e + DIGITS_BELOW)) / 2) / jnp.sum(weights)
 
     value_and_slope = jax.value_and_grad(loss)
     return BatchMean(lambda *args: (value_and_slope(*args), {}), devices, (False, False, True))

@@ -41,7 +41,7 @@ from jaxmpc.sets.lp import Program
 from jaxmpc.tuning.losses import TERMS, ClosedLoopLoss
 from jaxmpc.tuning.parameters import Parameter, is_diagonal
 from jaxmpc.tuning.result import TuningRun
-from jaxmpc.tuning.weights import SOLVER, tune_weights
+from jaxmpc.tuning.weights import LOOP_SOLVER, tune_weights
 
 # The largest fraction by which limits can be tightened.
 TIGHTEST = 0.5
@@ -205,7 +205,7 @@ def linear_task(
     terminal_weight: str = "given",
     rho: float | None = None,
     limits: Box | Polytope | None = None,
-    solver: ADMM = SOLVER,
+    solver: ADMM = LOOP_SOLVER,
     steps: int = 50,
     validation: float = 0.25,
     dtype: str = "float64",

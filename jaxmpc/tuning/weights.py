@@ -39,7 +39,7 @@ from jaxmpc.tuning.parameters import (
 from jaxmpc.tuning.result import Interrupted, TuningRun, finished
 
 # Where make_mpc returns a problem and no solver is given.
-SOLVER = ADMM(iterations=50, rho=1.0, alpha=1.6, newton_steps=20)
+LOOP_SOLVER = ADMM(iterations=50, rho=1.0, alpha=1.6, newton_steps=20)
 
 
 def tune_weights(
@@ -169,7 +169,7 @@ def prepared(
     train, test = settings.split((x0s, variations))
     require_variations(plant, {k: v for k, v in test[1].items() if k != LOOP}, len(test[0]))
     initial = {name: np.asarray(p.value) for name, p in parameters.items()}
-    build = partial(controller_of, make_mpc, solver=SOLVER if solver is None else solver)
+    build = partial(controller_of, make_mpc, solver=LOOP_SOLVER if solver is None else solver)
     try:
         controller = build(initial)
     except KeyError as error:

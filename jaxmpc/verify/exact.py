@@ -31,7 +31,7 @@ from jaxmpc.verify.stored_problem import Constraints
 
 UNIT_ROUNDOFF = 2.0**-53
 # Change of the inputs, relative to the largest, up to which it counts as rounding.
-TINY = 1e-9
+INPUT_ROUNDING = 1e-9
 
 
 def integers(values: Reals, e: int) -> np.ndarray:
@@ -53,7 +53,7 @@ def roll_out_exactly(p: Constraints, starts: np.ndarray, plans: np.ndarray) -> n
 
     Where rows are equalities, which no plan of floats keeps exactly, the margin is that of the
     plan with the rational change of its inputs that makes up for what it misses of them, less than
-    TINY of the largest input; a larger change counts as a broken limit.
+    INPUT_ROUNDING of the largest input; a larger change counts as a broken limit.
     """
     rows, X = p.equalities
     e = p.exponent(starts, plans, X)
@@ -69,7 +69,7 @@ def roll_out_exactly(p: Constraints, starts: np.ndarray, plans: np.ndarray) -> n
             moved = np.tensordot(missed @ K.T, change, axes=1)
             u, x = u * one + moved, x * one
             size = np.array([max(map(abs, v.ravel())) / (one << e) for v in moved])
-            much = size > TINY * (1 + np.abs(plans).max(axis=(1, 2)))
+            much = size > INPUT_ROUNDING * (1 + np.abs(plans).max(axis=(1, 2)))
             least = np.where(much, -size, least)
     for k, value, x_k in _values(p, e, x, u, one):
         end = x_k

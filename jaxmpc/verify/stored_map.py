@@ -25,7 +25,7 @@ from jaxmpc.verify.stored_problem import Constraints, by_policies, label_shapes
 
 # What stays of a store when it has been read; what its labels are proved by, those about affine
 # policies and tubes too; names of labels.
-KEPT = "label", "status"
+LABELLED = "label", "status"
 NEEDED = "start", "plan", "cut_normal", "cut_offset"
 OF_POLICIES = "cone", "answer", "corner", "policy_state", "policy_plan", "policy_answer"
 NAMES = {1: "feasible", -1: "infeasible", 0: "undecided"}
@@ -88,7 +88,7 @@ def verify_map(
         if report:
             found = read_report(Path(path), check)
         else:
-            found = read(path, check, label_shapes, keep=KEPT, visit=proofs.visit)
+            found = read(path, check, label_shapes, keep=LABELLED, visit=proofs.visit)
         result = Verification({}, problems=list(found.problems))
         if not found.whole:
             return result
@@ -150,7 +150,7 @@ def _count(found: Stored, result: Verification) -> bool:
         result.problems.append(f"{left} of {found.blocks} blocks are not done: resume the sweep")
     fields = {*found.attributes.get("variables", {}).get("fields", ()), *found.arrays}
     problem = found.attributes.get("problem", {})
-    needed = (*KEPT, *NEEDED, *OF_POLICIES) if by_policies(problem) else (*KEPT, *NEEDED)
+    needed = (*LABELLED, *NEEDED, *OF_POLICIES) if by_policies(problem) else (*LABELLED, *NEEDED)
     missing = [name for name in needed if name not in fields]
     if label is None or missing or not found.axes or "problem" not in found.attributes:
         result.problems.append(f"cannot be verified without {missing or 'its problem'}")

@@ -41,7 +41,7 @@ T = TypeVar("T")
 # Rounding of a set-point, relative: drifts and violations below that are none.
 RESTS = 1e-9
 # Rounding of optimal values, relative: a Lyapunov increase below that is none.
-ROUNDING = 1e-7
+COST_ROUNDING = 1e-7
 
 
 @record
@@ -73,7 +73,7 @@ class NominalLoops:
             f"of a soft row {self.slack:.3g}",
             f"largest distance left to the set-point, relative to the start: {self.left:.3g}",
         ]
-        if self.increase <= ROUNDING and np.isfinite(self.increase):
+        if self.increase <= COST_ROUNDING and np.isfinite(self.increase):
             what = "Lyapunov decrease V(x+) - V(x) <= -(x'Qx + u'Ru): kept on every step, margin"
             lines.append(f"{what} {-self.increase:.3g} V(x)")
         elif np.isfinite(self.increase):

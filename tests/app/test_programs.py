@@ -75,7 +75,7 @@ def test_processes_do_not_disturb_each_other(monkeypatch):
     left.mkdir()
     with kept_programs(["sweep"]):
         assert left.exists()
-    os.utime(left, (0, time.time() - 1.1 * program_cache.LEFT))
+    os.utime(left, (0, time.time() - 1.1 * program_cache.LEFT_BEHIND))
     with kept_programs(["sweep"]):
         assert not left.exists()
 

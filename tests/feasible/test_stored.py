@@ -59,7 +59,7 @@ def labelled(path, problem, lines, chunk, **changes):
 @pytest.mark.first(1)
 def test_says_what_a_map_of_all_points_says(tmp_path, monkeypatch, name, many):
     """Also where points and half-spaces are reduced again and again."""
-    monkeypatch.setattr(stored, "MANY", many)
+    monkeypatch.setattr(stored, "MANY_ROWS", many)
     monkeypatch.setattr(stored, "LINES", 10)
     problem = FeasibilityProblem.of(getattr(problems, name)())
     extent = 2.1 * np.ones(problem.dimension)
@@ -171,7 +171,7 @@ def test_extreme_points_span_the_hull(d):
     points = np.random.default_rng(d).standard_normal((200, d))
     found = extreme(points)
     assert hull_volume(found) == pytest.approx(hull_volume(points), rel=1e-12)
-    assert len(found) < 200 or d > stored.REDUCED
+    assert len(found) < 200 or d > stored.MOST_REDUCED
     flat = np.column_stack([points, np.zeros(200)])
     assert len(extreme(flat)) == 200 or d == 1 and len(extreme(flat)) in (2, 200)
 
@@ -179,7 +179,7 @@ def test_extreme_points_span_the_hull(d):
 class TestHalfSpaces:
     def test_intersection_is_kept(self, monkeypatch):
         """Of a polytope with known facets, hidden among many half-spaces that do not matter."""
-        monkeypatch.setattr(stored, "MANY", 40)
+        monkeypatch.setattr(stored, "MANY_ROWS", 40)
         random = np.random.default_rng(0)
         facets = random.standard_normal((7, 2))
         facets = np.concatenate([facets, -facets])
@@ -204,7 +204,7 @@ class TestHalfSpaces:
 
     def test_one_side_is_read_before_the_other(self, monkeypatch):
         """Unbounded at first: what bounds it on that side is kept all the same."""
-        monkeypatch.setattr(stored, "MANY", 40)
+        monkeypatch.setattr(stored, "MANY_ROWS", 40)
         found = HalfSpaces.none(np.array([[-2.0, -2], [2, 2]]))
         angle = np.linspace(0, 2 * np.pi, 401)[:-1]
         rows = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -217,7 +217,7 @@ class TestHalfSpaces:
 
     @pytest.mark.parametrize("d", [2, 5])
     def test_empty_intersections(self, monkeypatch, d):
-        monkeypatch.setattr(stored, "MANY", 40)
+        monkeypatch.setattr(stored, "MANY_ROWS", 40)
         normals = np.random.default_rng(0).standard_normal((100, d))
         empty = HalfSpaces.none(np.array([-np.ones(d), np.ones(d)])).add(normals, -np.ones(100))
         assert len(empty.offsets) == (40 if d == 2 else 100) and empty.vertices is None

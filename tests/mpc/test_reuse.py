@@ -19,7 +19,7 @@ pytestmark = [pytest.mark.cpu, pytest.mark.usefixtures("as_of_many")]
 @pytest.fixture
 def few(monkeypatch):
     """Transfer among `COUNT` states, in small programs; returns what was run on how many."""
-    monkeypatch.setattr(many, "MANY", COUNT)
+    monkeypatch.setattr(many, "MANY_STATES", COUNT)
     monkeypatch.setattr(many, "STATES_A_CELL", 16)
     run, log = many.Batch._run, []
 
@@ -163,8 +163,8 @@ def test_all_states_alike(mpc, few):
 
 
 def test_it_is_given_up_where_few_follow(mpc, states, solved, few, monkeypatch):
-    monkeypatch.setattr(many, "TRIAL", 1)
-    monkeypatch.setattr(many, "LEAST", 1.1)
+    monkeypatch.setattr(many, "TRIAL_CHUNKS", 1)
+    monkeypatch.setattr(many, "LEAST_FOLLOWED", 1.1)
     same_plans(jm.solve_many(mpc, states, chunk=64), solved)
     assert [arguments for arguments, _ in few] == [2, 4, 2] and few[1][1] == 64
 

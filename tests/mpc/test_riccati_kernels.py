@@ -86,7 +86,7 @@ def test_covariances_in_pieces_are_those_of_all_stages(monkeypatch):
         given = jnp.asarray(C), jnp.asarray(root @ root.swapaxes(1, 2))
         for on_gpu, long in ((False, 2), (True, 2), (True, 8)):
             monkeypatch.setattr(kernels, "on_gpu", lambda on_gpu=on_gpu: on_gpu)
-            monkeypatch.setattr(kernels, "LONG", long)
+            monkeypatch.setattr(kernels, "LONG_HORIZON", long)
             np.testing.assert_allclose(kernels.covariances(*given), expected, rtol=1e-12)
 
 
@@ -139,7 +139,7 @@ def test_long_horizons_are_divided(monkeypatch):
 
         expected, none = tracked()
         monkeypatch.setattr(kernels, "on_gpu", lambda: True)
-        monkeypatch.setattr(kernels, "LONG", 4)
+        monkeypatch.setattr(kernels, "LONG_HORIZON", 4)
         found, products = tracked()
         assert none is None and products.shape == (2, 3, 3)
         for a, b in zip(found, expected, strict=True):

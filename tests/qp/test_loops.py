@@ -178,7 +178,7 @@ def test_groups_cover_and_shrink():
 @pytest.mark.parametrize("long", [10, 5])
 def test_true_places(long, monkeypatch):
     """Put in their places, and looked up."""
-    monkeypatch.setattr(jax_transformations, "LONG", long)
+    monkeypatch.setattr(jax_transformations, "LONG_MASK", long)
     mask = np.array([0, 1, 1, 0, 1], bool)
     np.testing.assert_array_equal(true_places(mask, 2), [1, 2])
     np.testing.assert_array_equal(true_places(mask, 4), [1, 2, 4, 5])

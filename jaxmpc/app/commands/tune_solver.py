@@ -25,11 +25,11 @@ from jaxmpc.mpc.tightening import require_tightened
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status
 from jaxmpc.tuning.result import CHECKPOINT, TuningRun, run_folder
-from jaxmpc.tuning.solver import SOLVER, largest_residuals, tune_solver
+from jaxmpc.tuning.solver import ADMM_ALONE, largest_residuals, tune_solver
 from jaxmpc.tuning.tasks import feasible_states, initial_range
 
 FILES = ("solver.json", TUNED, "solver.png")
-KEPT = "no step is better on the validation states: the default is kept"
+DEFAULT_KEPT = "no step is better on the validation states: the default is kept"
 
 
 class TuneSolver(TuneSolverOptions):
@@ -68,7 +68,7 @@ class TuneSolver(TuneSolverOptions):
                 lambda: tune_solver(
                     mpc,
                     x0s[:-for_validation],
-                    solver=SOLVER,
+                    solver=ADMM_ALONE,
                     optimizer=optimizer,
                     validation=test,
                     checkpoint=checkpoint,
@@ -80,14 +80,14 @@ class TuneSolver(TuneSolverOptions):
                 )
             )
         seconds = time.perf_counter() - learning
-        given = dataclasses.replace(SOLVER, iterations=self.iterations)
+        given = dataclasses.replace(ADMM_ALONE, iterations=self.iterations)
         worst = residuals_of_feasible(mpc, test, (given, run.solver), **config.references())
         infeasible = without_plan + round(run.after["infeasible"])
         save_run(self.output, config, run, options, worst, infeasible, seconds)
         rows = [
             *solver_rows(run, worst.shape[1], infeasible),
             ("learning", f"{seconds:.1f} s, compiler included"),
-            ("safeguard", "passed: the tuned penalties are used" if run.improved else KEPT),
+            ("safeguard", "passed: the tuned penalties are used" if run.improved else DEFAULT_KEPT),
             ("files", " ".join(str(self.output / name) for name in (*FILES, CHECKPOINT))),
             ("total", f"{time.perf_counter() - begun:.1f} s with set-up and files"),
         ]

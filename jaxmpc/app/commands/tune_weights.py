@@ -47,7 +47,7 @@ from jaxmpc.tuning.tasks import (
     weight_loss,
     weight_parameters,
 )
-from jaxmpc.tuning.weights import SOLVER
+from jaxmpc.tuning.weights import LOOP_SOLVER
 
 FILES = ("tuning.json", TUNED, "tuning.png", "before_after.png", "maps.png")
 # Weight of the time to settle, in time steps, for a linear problem: without it the loss is about
@@ -236,7 +236,8 @@ def problem_of_file(command: TuneWeights) -> WeightProblem:
         rho = float(np.asarray(soft[-1].rho)) if isinstance(soft, tuple) and soft else 0.0
     config = with_numbers(config, hard, rho)
     solver = dataclasses.replace(
-        config.build_solver() or SOLVER, **given_options(command, "iterations", "newton_steps")
+        config.build_solver() or LOOP_SOLVER,
+        **given_options(command, "iterations", "newton_steps"),
     )
     steps = number_of_steps(command, config.system.dt, 100)
     require_sizes(command, steps, hard.system.n, hard.system.m)

@@ -48,7 +48,7 @@ NOT_NEGATIVE = Values(lambda value: 0 <= value < np.inf, "Give a finite number, 
 MASS = Values(lambda value: 0 <= value < np.inf, "Give a mass in kg")
 FINITE = Values(np.isfinite, "Give finite numbers")
 SHARE = Values(lambda value: 0 <= value < 1, "Give a fraction from 0 to below 1")
-PART = Values(lambda value: 0 < value < 1, "Give a fraction above 0 and below 1")
+OPEN_FRACTION = Values(lambda value: 0 < value < 1, "Give a fraction above 0 and below 1")
 WHOLE_OR_PART = Values(lambda value: 0 <= value <= 1, "Give a fraction from 0 to 1")
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from jaxmpc.app.options.shared import (
-    PART,
+    OPEN_FRACTION,
     POSITIVE,
     Horizon,
     Overwrite,
@@ -84,7 +84,7 @@ class TuneSolverOptions:
     """Number of feasible initial states, validation included."""
     batch: Annotated[int, option("B", "32"), at_least(1)] = 32
     """Number of states of each step, drawn again each time."""
-    validation: Annotated[float, option("FRACTION", "0.25"), PART] = 0.25
+    validation: Annotated[float, option("FRACTION", "0.25"), OPEN_FRACTION] = 0.25
     """Fraction of the initial states in the validation set."""
     optimizer: Annotated[str | None, option("NAME", "adam, its rate falling to 3 %")] = None
     """Optimizer of optax, by name: adam, adamw, sgd, rmsprop, lion, ..."""

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from jaxmpc.app.options.shared import (
     NOT_NEGATIVE,
-    PART,
+    OPEN_FRACTION,
     POSITIVE,
     SHARE,
     Horizon,
@@ -115,7 +115,7 @@ class TuneWeightsOptions:
     """Number of initial states, validation included."""
     batch: Annotated[int | None, option("B", "all training loops"), at_least(1)] = None
     """Number of loops of each step, drawn again each time."""
-    validation: Annotated[float, option("FRACTION", "0.25"), PART] = 0.25
+    validation: Annotated[float, option("FRACTION", "0.25"), OPEN_FRACTION] = 0.25
     """Fraction of the initial states in the validation set."""
     steps: Annotated[int | None, option("K", "100; robots: 1 s"), at_least(1)] = None
     """Length of the closed loops in time steps."""

@@ -28,9 +28,9 @@ from jaxmpc.qp.kernel import EXACT, barrier, call, dot, indices, load, padded_si
 from jaxmpc.qp.linalg import WAITS, batched, inverse_root_side_by_side, matmul, solve
 
 # Numbers along a side that a warp's registers hold.
-MOST = 32
+MOST_SIDE = 32
 # Stages from which on a horizon is divided into pieces on a GPU.
-LONG = 128
+LONG_HORIZON = 128
 
 
 class Gains(NamedTuple):
@@ -49,7 +49,7 @@ def recurrence(M: Array, w: Array, start: Array, *, adjoint: bool = False) -> Ar
 
     M (N, n, n), or (n, n) the same at all stages; w (N, n); start (n,).
     """
-    kernel = _recurrence_kernel if len(w) < LONG else _recurrence_in_pieces
+    kernel = _recurrence_kernel if len(w) < LONG_HORIZON else _recurrence_in_pieces
     scan, kernel = (partial(run, adjoint=adjoint) for run in (_scan, kernel))
     return _or_kernel(scan, kernel, M, w, start)
 
@@ -66,7 +66,7 @@ def tracking(
     """
     scan = partial(_tracking_by, partial(_scan, unroll=unroll))
     in_pieces = partial(_recurrence_in_pieces, products=gains.products)
-    kernel = _tracking_kernel if len(gu) < LONG else partial(_tracking_by, in_pieces)
+    kernel = _tracking_kernel if len(gu) < LONG_HORIZON else partial(_tracking_by, in_pieces)
     return _or_kernel(scan, kernel, gains, A, B, gx, gu)
 
 
@@ -78,16 +78,16 @@ def riccati_recursion(Q: Array, R: Array, cross: Any, A: Array, B: Array) -> Gai
     if cross is not None:
         gains = _riccati_scan(Q, R, A, B, cross)
     else:
-        kernel = _riccati_kernel if len(R) < LONG else _riccati_in_pieces
+        kernel = _riccati_kernel if len(R) < LONG_HORIZON else _riccati_in_pieces
         gains = _or_kernel(_riccati_scan, kernel, Q, R, A, B, lanes=_riccati_lanes)
-    if not on_gpu() or len(R) < LONG or A.shape[-1] > MOST:
+    if not on_gpu() or len(R) < LONG_HORIZON or A.shape[-1] > MOST_SIDE:
         return gains
     return gains._replace(products=_products(jax.lax.stop_gradient(gains.closed), len(R)))
 
 
 def covariances(closed: Array, noise: Array) -> Array:
     """Σ (N, n, n) after each stage: Σ⁺ = C Σ C' + W from Σ = 0 with C, W (N, n, n) of the stage."""
-    kernel = _recurrence_kernel if len(noise) < LONG else _recurrence_in_pieces
+    kernel = _recurrence_kernel if len(noise) < LONG_HORIZON else _recurrence_in_pieces
     return _or_kernel(_scan, kernel, closed, noise, jnp.zeros_like(noise[0]))
 
 
@@ -95,12 +95,12 @@ def _or_kernel(scan: Callable, kernel: Callable, *args: Any, lanes: Any = None) 
     """The kernel where it runs, or on CPUs `lanes`, the scan of a batch in the last axis; both with
     the derivative of the scan."""
     longest = max(size for v in jax.tree.leaves(args) for size in v.shape[-1:])
-    if longest > MOST:
+    if longest > MOST_SIDE:
         return scan(*args)
     if not on_gpu():
         if lanes is None or WAITS:  # the fusions of those versions of XLA compute products again
             return scan(*args)
-        kernel = batched(lambda *args: scan(*args), lanes, MOST)
+        kernel = batched(lambda *args: scan(*args), lanes, MOST_SIDE)
     return with_derivative_of(scan, kernel)(*args)
 
 
