@@ -30,7 +30,7 @@ from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.parameters import FIELDS, NONNEGATIVE, OF_PLANTS, PAYLOAD, require_numbers
 from jaxmpc.robots.robot import Robot, RobotModel
 from jaxmpc.systems.riccati import UNREACHED, least_reached, lqr
-from jaxmpc.systems.system import LinearSystem, host_matrices
+from jaxmpc.systems.system import LinearSystem, host_matrices, numbered
 from jaxmpc.systems.units import balanced, less_identity, natural_units
 
 # Singular values of balanced matrices, relative to the largest, that count as zero.
@@ -392,7 +392,7 @@ class KalmanFilter:
             return
         hidden = np.abs(axes[values <= UNDETECTED * values[0]])
         large = np.any(hidden > 0.1 * hidden.max(axis=1, keepdims=True), axis=0)
-        names = system.state_names or tuple(f"x{i + 1}" for i in range(n))
+        names = system.state_names or numbered("x", n)
         states = [name for name, one in zip(names, large[:n], strict=True) if one]
         loads = [name for name, one in zip(self._load_names(), large[n:], strict=True) if one]
         if not loads:

@@ -22,7 +22,7 @@ from jaxmpc.pytrees import prepared_pytree
 from jaxmpc.qp.linalg import arrays, matmul
 from jaxmpc.qp.status import Status
 from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope
-from jaxmpc.systems.system import LinearSystem, host_matrices
+from jaxmpc.systems.system import LinearSystem, host_matrices, numbered
 
 
 @prepared_pytree
@@ -237,7 +237,7 @@ def augmented(mpc: MPC, observer: KalmanFilter) -> MPC:
     k = observer.disturbances
     A, B, c = host_matrices(system)
     top, zeros = np.hstack([A, host_array("observer", observer.on_states(B))]), np.zeros
-    names = system.state_names or tuple(f"x{i + 1}" for i in range(system.n))
+    names = system.state_names or numbered("x", system.n)
     units = system.state_units and system.state_units + ("",) * k
     more = replace(
         system,

@@ -36,7 +36,7 @@ from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope, Zonotope
 from jaxmpc.sets.disturbances import is_centred, require_disturbance
 from jaxmpc.sets.fields import require_dimension
 from jaxmpc.sets.limits import output_limits
-from jaxmpc.systems.system import LinearSystem, host_matrices
+from jaxmpc.systems.system import LinearSystem, host_matrices, numbered
 
 T = TypeVar("T")
 StagesOf = Callable[[], tuple[int, ...]]
@@ -685,7 +685,7 @@ class MPC:
             S = cost + closed.T @ S @ closed + K.T @ effort @ K + rate.T @ W @ rate
 
     def _refuse_flat(self, k: int, directions: np.ndarray) -> None:
-        labels = self.system.input_names or tuple(f"u{i + 1}" for i in range(self.system.m))
+        labels = self.system.input_names or numbered("u", self.system.m)
         large = (abs(directions) > 0.1 * abs(directions).max(axis=0)).any(axis=1)
         names = ", ".join(name for name, one in zip(labels, large, strict=True) if one)
         if self.stage_weights is not None and np.asarray(self.stage_weights)[k] == 0:
@@ -833,10 +833,10 @@ def soften(mpc: MPC, rho: Reals, quadratic: Reals = 0.0) -> MPC:
             names, units = mpc.system.state_names, mpc.system.state_units
             if isinstance(limits, Polytope):
                 names, units = limits.labels, ()
-            names = names or _numbered(kind, np.shape(lower)[-1])
+            names = names or numbered(f"{kind} row ", np.shape(lower)[-1])
             hard.append(Outputs(C, lower, upper, None, stages, names, units))
     for rows in as_tuple("outputs", mpc.outputs, Outputs):
-        names = rows.names or _numbered("output", np.shape(rows.sides[0])[-1])
+        names = rows.names or numbered("output row ", np.shape(rows.sides[0])[-1])
         hard.append(replace(rows, stages=output_stages(mpc, rows), names=names))
     soft = list(as_tuple("soft", mpc.soft, Soft))
     for rows in filter(None, map(_with_limits, hard)):
@@ -847,10 +847,6 @@ def soften(mpc: MPC, rho: Reals, quadratic: Reals = 0.0) -> MPC:
     softened = replace(mpc, states=None, terminal_set=None, outputs=(), soft=tuple(soft))
     softened.validate()
     return softened
-
-
-def _numbered(kind: str, count: int) -> tuple[str, ...]:
-    return tuple(f"{kind} row {i + 1}" for i in range(count))
 
 
 def _with_limits(rows: Outputs) -> Outputs | None:

@@ -25,6 +25,7 @@ from jaxmpc.pytrees import pytree, record, static
 from jaxmpc.qp.linalg import apply, apply_transposed, cholesky, matmul, namespace
 from jaxmpc.qp.problem import Bounds
 from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope
+from jaxmpc.systems.system import numbered
 
 # (kind, steps, rows a step) of each block of rows.
 Layout = tuple[tuple[str, tuple[int, ...], int], ...]
@@ -166,8 +167,8 @@ def given_blocks(mpc: MPC, dtype: DTypeLike) -> list[Block]:
     system, N, n, m = mpc.system, mpc.horizon, mpc.system.n, mpc.system.m
     found: list[Block] = []
     xp, dtype = namespace(mpc), jax.dtypes.canonicalize_dtype(dtype)
-    state_names = system.state_names or tuple(f"x{i + 1}" for i in range(n))
-    input_names = system.input_names or tuple(f"u{i + 1}" for i in range(m))
+    state_names = system.state_names or numbered("x", n)
+    input_names = system.input_names or numbered("u", m)
     of_states = state_names, system.state_units
     of_inputs = input_names, system.input_units
 

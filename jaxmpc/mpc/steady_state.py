@@ -23,7 +23,7 @@ from jaxmpc.qp.residuals import with_fault
 from jaxmpc.qp.solve import solve_factored
 from jaxmpc.sets.convex_sets import Box
 from jaxmpc.sets.lp import scaling
-from jaxmpc.systems.system import LinearSystem, host_matrices
+from jaxmpc.systems.system import LinearSystem, host_matrices, numbered
 from jaxmpc.systems.units import balanced, less_identity
 
 # Singular values of balanced matrices, relative to the largest, that count as zero.
@@ -182,7 +182,7 @@ class SteadyStates:
         row, column = balanced(M)
         left, values, right = np.linalg.svd(row[:, None] * M * column)
         if values[-1] <= SINGULAR * values[0]:
-            names = system.state_names or tuple(f"x{i + 1}" for i in range(n))
+            names = system.state_names or numbered("x", n)
             entry = np.abs(left[:, -1])
             which = [name for name, v in zip(names, entry, strict=True) if v > 0.1 * entry.max()]
             what = f"no input holds a load on {', '.join(which)}, which integrates it"

@@ -288,9 +288,14 @@ def host_matrices(
     return A, B, c
 
 
+def numbered(word: str, count: int) -> tuple[str, ...]:
+    """Return the names of what has none, such as x1, x2."""
+    return tuple(f"{word}{i + 1}" for i in range(count))
+
+
 def _labels(
     letter: str, count: int, names: tuple[str, ...], units: tuple[str, ...]
 ) -> tuple[str, ...]:
-    names = names or tuple(f"{letter}{i + 1}" for i in range(count))
+    names = names or numbered(letter, count)
     pairs = zip(names, units or ("",) * len(names), strict=True)
     return tuple(f"{name} [{unit}]" if unit else name for name, unit in pairs)

@@ -36,6 +36,7 @@ from jaxmpc.qp.admm import ADMM
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.load import load_robot, model_hash
 from jaxmpc.sets.convex_sets import Ellipsoid, Polytope
+from jaxmpc.systems.system import numbered
 from jaxmpc.tuning.parameters import is_diagonal
 from jaxmpc.tuning.result import CHECKPOINT, TuningRun, run_folder
 from jaxmpc.tuning.tasks import (
@@ -491,8 +492,8 @@ def labelled(
     """Return the weights by step: group → entry → (T+1,); of matrices their diagonal."""
     plant = task.plant
     if isinstance(plant, LinearPlant):
-        states = list(plant.system.state_names) or [f"x{i + 1}" for i in range(plant.n)]
-        inputs = list(plant.system.input_names) or [f"u{i + 1}" for i in range(plant.m)]
+        states = list(plant.system.state_names or numbered("x", plant.n))
+        inputs = list(plant.system.input_names or numbered("u", plant.m))
     else:
         states, inputs, half = list(plant.state_names), list(plant.input_names), plant.n // 2
         if states[:half] == states[half:]:

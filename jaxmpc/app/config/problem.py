@@ -29,7 +29,7 @@ from jaxmpc.qp.admm import ADMM
 from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope
 from jaxmpc.sets.invariant import named_terminal_set
 from jaxmpc.systems.riccati import LQR, lqr
-from jaxmpc.systems.system import LinearSystem
+from jaxmpc.systems.system import LinearSystem, numbered
 
 
 def _infinity(value: Any) -> Any:
@@ -417,7 +417,7 @@ class Config:
     @property
     def coordinate_names(self) -> tuple[str, ...]:
         """Names of these coordinates, where states have names."""
-        inputs = self.system.input_names or tuple(f"u{i + 1}" for i in range(len(self.system.B[0])))
+        inputs = self.system.input_names or numbered("u", len(self.system.B[0]))
         names = self.system.state_names or ()
         previous = tuple(f"previous {name}" for name in inputs) if names else ()
         return (names + previous)[: self.dimension]

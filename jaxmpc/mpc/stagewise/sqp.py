@@ -172,7 +172,7 @@ def _full_targets(
     own = [task.target for task in problem.tasks]
     given = own if targets is None else entries("targets", targets, cure)
     if len(given) != len(problem.tasks):
-        fail("targets", f"{len(given)} for {len(problem.tasks)} tasks", "Give one for each task")
+        fail("targets", f"{len(given)} for {len(problem.tasks)} tasks", cure)
     full = []
     for i, (value, size) in enumerate(zip(given, problem.sizes(), strict=True)):
         shape = (problem.mpc.horizon + 1, size)
