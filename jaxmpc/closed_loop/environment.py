@@ -10,6 +10,7 @@ from jax import Array
 from jaxmpc.arrays import Reals, as_floats, as_weight
 from jaxmpc.checks import fail, number, require_kind, require_shape, require_symmetric_psd, whole
 from jaxmpc.closed_loop.feedback import Feedback, model_of
+from jaxmpc.closed_loop.orientations import error_of
 from jaxmpc.closed_loop.robot_controller import robot_mpc
 from jaxmpc.closed_loop.variations import free_motions, start_room
 from jaxmpc.mpc.plan import limited
@@ -135,7 +136,8 @@ class Environment:
         robot, dtype = self.robot, state.x.dtype
         require_shape("action", action, (robot.m,), "One number an input; use jax.vmap for many")
         u = limited(robot.input_limits, jnp.asarray(action, dtype))
-        error = robot.coordinates(state.x) - jnp.asarray(self.reference, dtype)
+        xi, target = robot.coordinates(state.x), jnp.asarray(self.reference, dtype)
+        error = error_of(robot, robot.state_limits, xi, target)
         effort = u - jnp.asarray(self.input_reference, dtype)
         square = lambda v, W: jnp.sum(v * matmul(jnp.asarray(W, dtype), v))
         reward = -square(error, self.Q) - square(effort, self.R)

@@ -1,7 +1,7 @@
 """Noise of a plant and of its measurements, and the Kalman filter that estimates the state, with
 constant disturbances beside it."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -26,7 +26,9 @@ from jaxmpc.checks import (
 from jaxmpc.mpc.stagewise.nonlinear import NonlinearMPC, linear_model
 from jaxmpc.pytrees import named_pytree, pytree, static
 from jaxmpc.qp.linalg import arrays, matmul, solve, symmetric, symmetric_root
+from jaxmpc.robots.configurations import nearest_turns, quaternions, rotations
 from jaxmpc.robots.linear_plant import LinearPlant
+from jaxmpc.robots.mujoco_access import BALL
 from jaxmpc.robots.parameters import FIELDS, NONNEGATIVE, OF_PLANTS, PAYLOAD, require_numbers
 from jaxmpc.robots.robot import Robot, RobotModel
 from jaxmpc.systems.riccati import UNREACHED, least_reached, lqr
@@ -443,7 +445,7 @@ class KalmanFilter:
         mean, P = belief
         C = jnp.asarray(self._outputs_of_all(), mean.dtype)
         known, expected = jnp.all(jnp.isfinite(y)), matmul(C, mean)
-        error = jnp.where(known, y, expected) - expected
+        error = jnp.where(known, self._nearest_turns(y, expected), expected) - expected
         if P is None:
             return Belief(mean + matmul(jnp.asarray(self.gain, mean.dtype), error), None)
         V = jnp.asarray(covariance(self.measurement, self.p), mean.dtype)
@@ -475,7 +477,8 @@ class KalmanFilter:
         after = model_step(model, xi, u)
         for more in (of_states, known):
             after = after if more is None else after + more
-        after = jnp.concatenate([after, d])
+        canonical = _canonical(model)
+        moved, after = after, jnp.concatenate([canonical(after), d])
         if P is None:
             return Belief(after, None)
         A, B = (jnp.asarray(v, d.dtype) for v in _slopes(model, xi, u))
@@ -483,8 +486,26 @@ class KalmanFilter:
         if self.estimates_numbers:
             of_numbers = jax.jacfwd(lambda d: model_step(self._informed(d, numbers), xi, u))(d)
             A = jnp.asarray(A).at[: len(xi), len(xi) :].add(of_numbers)
+        if canonical is not _as_it_is:
+            turned = matmul(jax.jacfwd(canonical)(moved), jnp.asarray(A)[: len(xi)])
+            A = jnp.concatenate([turned, A[len(xi) :]])
         W = jnp.asarray(self._covariance("process"), d.dtype)
         return Belief(after, matmul(A, matmul(P, A.T)) + W)
+
+    def _nearest_turns(self, y: Array, expected: Array) -> Array:
+        """Return the outputs (p,) with rotation vectors that are measured whole, of free bodies and
+        ball joints, as those of the same orientations which are nearest to the expected ones."""
+        model = _robot_model(self.model)
+        if model is None:
+            return y
+        C = jnp.eye(self.p, self.model.n) if self.C is None else jnp.asarray(self.C)
+        for motion in rotations(model.robot.joints):
+            places = C[:, None] == jnp.eye(self.model.n, dtype=C.dtype)[motion]
+            found = jnp.all(places, axis=2)  # (p, 3)
+            at = jnp.argmax(found, axis=0)
+            nearest = nearest_turns((BALL,), y[at], expected[at])
+            y = y.at[at].set(jnp.where(jnp.all(jnp.any(found, axis=0)), nearest, y[at]))
+        return y
 
     def _outputs_of_all(self) -> Any:
         """Return (C, C_d) (p, n + k), the outputs of states and disturbances."""
@@ -549,6 +570,18 @@ def _robot_model(model: Any) -> RobotModel | None:
     model = model.model if isinstance(model, NonlinearMPC) else model
     model = RobotModel(model, exact=False) if isinstance(model, Robot) else model
     return model if isinstance(model, RobotModel) else None
+
+
+def _as_it_is(xi: Array) -> Array:
+    return xi
+
+
+def _canonical(model: Any) -> Callable[[Array], Array]:
+    """Return the function that makes rotation vectors ones of at most half a turn."""
+    found = _robot_model(model)
+    if found is None or not quaternions(found.robot.joints):
+        return _as_it_is
+    return lambda xi: found.robot.coordinates(found.robot.state(xi))
 
 
 def _number(model: Any, kind: str) -> Any:

@@ -7,6 +7,7 @@ from jax import Array
 
 from jaxmpc.arrays import Reals
 from jaxmpc.checks import fail, require_finite, require_shape
+from jaxmpc.closed_loop.orientations import error_of
 from jaxmpc.mpc.controller import zeros_of
 from jaxmpc.mpc.plan import Control, limited, require_before
 from jaxmpc.mpc.problem import MPC, at_stage
@@ -166,8 +167,9 @@ class LinearFeedback:
         self.validate()
         require_before(before)
         x = one_state(self, x)
-        r, s = (0 if v is None else first_row(v, x.dtype) for v in (reference, input_reference))
-        u = s + matmul(jnp.asarray(self.K, x.dtype), self.coordinates(x) - r)
+        r, s = (None if v is None else first_row(v, x.dtype) for v in (reference, input_reference))
+        error = error_of(self.plant, self.mpc, self.coordinates(x), r)
+        u = (0 if s is None else s) + matmul(jnp.asarray(self.K, x.dtype), error)
         u = limited(self.mpc.inputs, u)
         not_run, no_slack = jnp.asarray(Status.NOT_RUN, jnp.int32), jnp.zeros((1, 0), x.dtype)
         return Control(u, NoPlan(jnp.asarray(jnp.nan, x.dtype), not_run, no_slack), None)

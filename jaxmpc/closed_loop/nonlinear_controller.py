@@ -12,6 +12,7 @@ from jax import Array
 from jaxmpc.arrays import Reals
 from jaxmpc.checks import fail, require_kind
 from jaxmpc.closed_loop.feedback import Feedback, first_row, one_state
+from jaxmpc.closed_loop.orientations import aligned
 from jaxmpc.mpc.controller import zeros_of
 from jaxmpc.mpc.plan import (
     Control,
@@ -152,6 +153,7 @@ class NonlinearController:
             reference, input_reference = held_references(
                 self.model, model, reference, input_reference, self.dtype
             )
+        x, reference = aligned(self.model, self.mpc, x, reference)
         search = {"iterations": self.sqp_steps, "hessian": self.hessian, "scale": self.scale}
         aims = {"input_reference": input_reference, "previous_input": previous_input}
         return sqp_control(problem, self.solver, x, before, reference, **aims, **search)

@@ -9,6 +9,7 @@ import numpy as np
 
 from jaxmpc.arrays import Reals, host_array
 from jaxmpc.checks import fail, require_finite, require_kind, require_shape
+from jaxmpc.closed_loop.orientations import host_errors
 from jaxmpc.closed_loop.simulation import Run
 from jaxmpc.closed_loop.stored_runs import StoredRuns
 from jaxmpc.files import versions
@@ -73,7 +74,8 @@ def evaluate_runs(
         lower, upper = plant.state_limits.bounds()
         velocities = np.arange(plant.n) >= plant.mujoco.nv
         band = np.where(velocities & np.isinf(lower) & np.isinf(upper), np.inf, band)
-    inside = (np.abs(xi - host_array("reference", reference)) <= band).all(axis=2)
+    inside = np.abs(host_errors(plant, xi, host_array("reference", reference))) <= band
+    inside = inside.all(axis=2)
     # Time steps before the last stretch inside: T + 1 less its length.
     before = inside.shape[1] - np.cumprod(inside[:, ::-1], axis=1).sum(axis=1)
     state_excess, input_excess = (row_violations(*pair) for pair in limits)

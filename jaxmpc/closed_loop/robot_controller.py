@@ -23,8 +23,9 @@ from jaxmpc.closed_loop.nonlinear_controller import (
     resting_start,
     sqp_control,
 )
+from jaxmpc.closed_loop.orientations import aligned, rotating_joints
 from jaxmpc.mpc.controller import Controller
-from jaxmpc.mpc.plan import Control, Plan, applied, limited, require_before
+from jaxmpc.mpc.plan import Control, Plan, anchored, applied, limited, require_before
 from jaxmpc.mpc.problem import MPC, Outputs, Soft, as_tuple, soften
 from jaxmpc.mpc.rows import layout
 from jaxmpc.mpc.stagewise.nonlinear import NonlinearMPC, Task
@@ -405,7 +406,7 @@ class RobotController:
             "input_reference": input_reference,
             "previous_input": previous_input,
         }
-        xi = self.coordinates(x)
+        xi, reference = aligned(self.robot, self.mpc, self.coordinates(x), reference)
         where = f"with linearize={self.linearize!r} of a {type(self.robot).__name__}"
         told = given_numbers(self, numbers, where, 'linearize="state" or "trajectory" and a Robot')
         if self.fixed is not None:
@@ -413,6 +414,7 @@ class RobotController:
         if forecast is not None:
             what = f"given with linearize={self.linearize!r}"
             fail("forecast", what, 'Give linearize="set-point", or leave it out')
+        problem = self.problem
         if told:
             file, loaded = (
                 RobotModel(self.robot, dict(part or {}), exact=False) for part in ({}, numbers)
@@ -420,22 +422,20 @@ class RobotController:
             reference, known["input_reference"] = held_references(
                 file, loaded, reference, input_reference, self.dtype
             )
+            problem = replace(problem, model=replace(loaded, exact=self.exact))
         if self.linearize == "trajectory":
             search = {"iterations": self.sqp_steps, "hessian": self.hessian, "scale": self.scale}
-            problem = self.problem
-            if told:
-                problem = replace(problem, model=replace(loaded, exact=self.exact))
             return sqp_control(problem, self.solver, xi, before, reference, **known, **search)
         memory = None if before is None else before.memory
         last = last_input(self.soft, before, previous_input)
         rows = layout(self.soft)
         start = None if memory is None else memory.shifted(rows, memory.inputs[-1])
+        if start is not None and rotating_joints(self.robot):
+            start = anchored(start, xi)
         inputs = at_rest(self.soft, xi, input_reference)[1] if memory is None else memory.inputs
         about = limited(self.soft.inputs, inputs[0])
-        with_numbers = {"numbers": numbers} if told else {}  # a LinearPlant takes none
-        system = self.robot.linearize(x, about, exact=self.exact, **with_numbers)
         known |= {"previous_input": last, "scale": self.scale}
-        mpc = replace(self.soft, system=system)
+        mpc = replace(self.soft, system=problem.model.linearize(xi, about))
         plan = solve_stagewise(mpc, xi, reference, self.solver, start, **known)
         return applied(self.soft, rows, plan, memory, last)
 

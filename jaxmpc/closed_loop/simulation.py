@@ -30,6 +30,7 @@ from jaxmpc.batches import (
 from jaxmpc.checks import fail, require_kind, require_real, require_untraced, whole
 from jaxmpc.closed_loop.estimation import Belief, KalmanFilter, Noise, model_step
 from jaxmpc.closed_loop.feedback import Feedback, LinearFeedback, Plant, first_row, model_of
+from jaxmpc.closed_loop.orientations import error_of
 from jaxmpc.mpc.plan import Control, checked_aim, checked_array, reference_shapes
 from jaxmpc.mpc.problem import weights_of
 from jaxmpc.pytrees import pytree, static
@@ -367,8 +368,9 @@ class Loop:
         if hasattr(controller, "distance"):
             error = controller.distance(x, r, t)
         else:
-            error = _distance(controller.coordinates(x), r)
-        effort = _distance(u, s)
+            r = None if r is None else first_row(r, x.dtype)
+            error = error_of(model_of(controller), controller.mpc, controller.coordinates(x), r)
+        effort = u if s is None else u - first_row(s, u.dtype)
         return jnp.sum(error * matmul(self.Q, error)) + jnp.sum(effort * matmul(self.R, effort))
 
     def violation(self, x: Array) -> Array:
@@ -423,13 +425,6 @@ class Loop:
             belief = self.predicted(belief, u, t)
         after = after if disturbance is None else after + disturbance
         return (after, control, control.u, belief), record
-
-
-def _distance(value: Array, target: Array | None) -> Array:
-    """Return the distance from a reference, or from its first row."""
-    if target is None:
-        return value
-    return value - first_row(target, value.dtype)[: len(value)]
 
 
 @partial(jax.jit, static_argnames=("steps", "checkpoint"))

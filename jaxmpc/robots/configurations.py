@@ -43,6 +43,26 @@ def blocks(joints: Sequence[int]) -> list[Block]:
     return found
 
 
+def rotations(joints: Sequence[int]) -> list[slice]:
+    """Return where the rotation vectors of orientations are in motions (nv,)."""
+    return [motion for _, motion, turns in blocks(joints) if turns]
+
+
+def nearest_turns(joints: Sequence[int], dq: Array, near: Array) -> Array:
+    """Return the motions dq (nv + …,) with their rotation vectors in place of which those of the
+    same orientation, v + 2πk v/|v|, are nearest to those of `near`, and at most 3π/2 long:
+    `retract` is singular at 2π."""
+    for motion in rotations(joints):
+        v = dq[motion]
+        square = jnp.sum(v**2)
+        length = jnp.sqrt(jnp.where(square > 0, square, 1.0))
+        k = jnp.round((jnp.dot(v / length, near[motion]) - length) / (2 * np.pi))
+        ratio = 1 + 2 * np.pi * k / length
+        short = (square > 0) & (jnp.abs(ratio) * length <= 1.5 * np.pi)
+        dq = dq.at[motion].set(jnp.where(short, ratio, 1.0) * v)
+    return dq
+
+
 def unit_orientations(argument: str, joints: Sequence[int], q: np.ndarray) -> np.ndarray:
     """Return the configurations q (..., nq) with quaternions of length 1; raise ValueError, naming
     the argument, where one is far from that."""

@@ -19,12 +19,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxmpc.arrays import host_array
+from jaxmpc.arrays import as_floats, host_array
 from jaxmpc.checks import fail, require_finite, require_shape
 from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.jax_transformations import own_modes, varying
 from jaxmpc.qp.linalg import matmul
-from jaxmpc.robots.configurations import difference, quaternions, retract
+from jaxmpc.robots.configurations import difference, nearest_turns, quaternions, retract
 from jaxmpc.robots.contacts import standing_physics
 from jaxmpc.robots.couplings import MET, Couplings
 from jaxmpc.robots.description import RobotDescription
@@ -81,24 +81,26 @@ class Robot(RobotDescription):
         """Return the affine model ξ⁺ = A ξ + B u + c of a whole control period about x (nq + nv,),
         u (m,).
 
-        It is of the predictor, by automatic differentiation. exact=False: one physics step is
-        linearised and its affine map applied `substeps` times (a tenth of the cost; on a 7-joint
-        arm A is off by 1 %, B by 0.05 %). exact=True: Jacobians along the physics steps, and c such
-        that the model passes through the predictor's own next state. A robot with couplings always
-        gets this: their forces differ from one physics step to the next. numbers: fields of
-        mjx.Model in place of the predictor's own, see `vary`.
+        Rotation vectors of ξ⁺ are those nearest to those of ξ, also where these come to more than
+        half a turn. It is of the predictor, by automatic differentiation. exact=False: one physics
+        step is linearised and its affine map applied `substeps` times (a tenth of the cost; on a
+        7-joint arm A is off by 1 %, B by 0.05 %). exact=True: Jacobians along the physics steps,
+        and c such that the model passes through the predictor's own next state. A robot with
+        couplings always gets this: their forces differ from one physics step to the next. numbers:
+        fields of mjx.Model in place of the predictor's own, see `vary`.
         """
-        exact = exact or bool(equalities(self.predictor.model))
-        require_numbers(self.predictor, numbers or {})
-        return _linearized(self, *self.checked_arrays(x, u), numbers or {}, exact=exact)
+        x, u = self.checked_arrays(x, u)
+        return RobotModel(self, numbers or {}, exact).linearize(self.coordinates(x), u)
 
-    def _linearize(self, x: Array, u: Array, numbers: dict[str, Any], exact: bool) -> LinearSystem:
+    def _linearize(
+        self, start: Array, u: Array, numbers: dict[str, Any], exact: bool
+    ) -> LinearSystem:
         def step(xi: Array, u: Array) -> tuple[Array, Array]:
             after = self.coordinates(self.predictor.step(self.state(xi), u, numbers))
+            after = nearest_turns(self.joints, after, xi)
             return after, after
 
         one = jax.jacfwd(step, argnums=(0, 1), has_aux=True)
-        start = self.coordinates(x)
         if exact:
             Chain = tuple[Array, Array, Array]
 
@@ -107,8 +109,8 @@ class Robot(RobotDescription):
                 (A_1, B_1), after = one(xi, u)
                 return (after, matmul(A_1, A), matmul(A_1, B) + B_1), None
 
-            zero = jnp.zeros((self.n, self.m), x.dtype)
-            first = (start, jnp.eye(self.n, dtype=x.dtype), zero)
+            zero = jnp.zeros((self.n, self.m), start.dtype)
+            first = (start, jnp.eye(self.n, dtype=start.dtype), zero)
             (after, A, B), _ = jax.lax.scan(chain, varying(first, first), length=self.substeps)
             c = after - matmul(A, start) - matmul(B, u)
         else:
@@ -346,16 +348,20 @@ class RobotModel:
     exact: bool = static(default=True)
 
     def step(self, xi: Array, u: Array) -> Array:
-        """Return ξ (n,) one control period later."""
+        """Return ξ (n,) one control period later, its rotation vectors nearest to those of ξ."""
         robot = self.robot
         require_numbers(robot.predictor, self.numbers)
         advance = lambda x, _: (robot.predictor.step(x, u, self.numbers), None)
-        return robot.coordinates(jax.lax.scan(advance, robot.state(xi), length=robot.substeps)[0])
+        after = jax.lax.scan(advance, robot.state(xi), length=robot.substeps)[0]
+        return nearest_turns(robot.joints, robot.coordinates(after), xi)
 
     def linearize(self, xi: Array, u: Array) -> LinearSystem:
-        """Return the affine model about ξ, u."""
-        state = self.robot.state(xi)
-        return self.robot.linearize(state, u, exact=self.exact, numbers=self.numbers)
+        """Return the affine model about ξ, u; see `Robot.linearize`."""
+        robot = self.robot
+        require_numbers(robot.predictor, self.numbers)
+        exact = self.exact or bool(equalities(robot.predictor.model))
+        xi = jnp.asarray(as_floats(xi))
+        return _linearized(robot, xi, jnp.asarray(u, xi.dtype), self.numbers, exact=exact)
 
     def view(self, xi: Array, u: Array) -> Any:
         """Return mjx.Data at ξ under u: qpos, qvel, act, ctrl, the poses and velocities of bodies,

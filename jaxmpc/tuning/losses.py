@@ -1,6 +1,7 @@
 """ClosedLoopLoss: the cost of a closed loop, as a differentiable number; several losses at once."""
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import jax
@@ -20,6 +21,7 @@ from jaxmpc.checks import (
     require_shape,
     require_symmetric_psd,
 )
+from jaxmpc.closed_loop.orientations import error_of
 from jaxmpc.closed_loop.simulation import Run
 from jaxmpc.pytrees import record
 from jaxmpc.qp.linalg import matmul
@@ -119,7 +121,9 @@ class ClosedLoopLoss:
         r, s = self._aim("reference", T, n), self._aim("input_reference", T, m)
         if r.ndim == 2:
             r = jnp.concatenate([r, r[-1:]])[: T + 1]
-        e, v = x - r, run.inputs - (s[:T] if s.ndim == 2 else s)
+        r = jnp.broadcast_to(r, x.shape)
+        e = jax.vmap(partial(error_of, self.plant, self.limits))(x, r)
+        v = run.inputs - (s[:T] if s.ndim == 2 else s)
         square = lambda v, W: jnp.sum(v * matmul(v, jnp.asarray(W, dtype)))
         terms = {"tracking": square(e[:-1], self.Q) / T, "effort": square(v, self.R) / T}
         if self.limits is not None and _counts(self.violation):

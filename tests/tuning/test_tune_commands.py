@@ -344,7 +344,7 @@ def test_the_picture_has_residuals_of_the_default():
     """Whose penalty is None."""
     mpc = problems.joint(5)
     given, other = (
-        replace(tune_solver.SOLVER, iterations=20),
+        replace(tune_solver.ADMM_ALONE, iterations=20),
         ADMM(iterations=20, newton_steps=0, rho=0.3),
     )
     states = np.array([[0.1, 0.2], [-0.3, 0.1]])
