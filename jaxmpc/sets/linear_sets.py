@@ -790,9 +790,13 @@ class Box(LinearSet):
         # No bound stays none, whatever the other set.
         free_below, free_above = lower == -np.inf, upper == np.inf
         with np.errstate(invalid="ignore"):
-            return Box(
-                np.where(free_below, lower, lower - low), np.where(free_above, upper, upper - high)
-            )
+            below = np.where(free_below, lower, lower - low)
+            above = np.where(free_above, upper, upper - high)
+            # Sides that pass each other by the rounding of these differences are one.
+            gap, terms = below - above, abs(lower) + abs(low) + abs(upper) + abs(high)
+            middle = (below + above) / 2
+        one = (gap > 0) & (cleaned(gap, terms) == 0)
+        return Box(np.where(one, middle, below), np.where(one, middle, above))
 
     def image(self, M: Reals, t: Reals | None = None) -> "Zonotope | Polytope":
         """Return {M x + t : x in the box}, M any matrix (k, n): a Zonotope if the box is bounded,
@@ -829,8 +833,10 @@ class Box(LinearSet):
         empty where a value is out of its bounds."""
         lower, upper = self._ends()
         fixed, at, rest = section(values, len(lower))
-        inside = np.all((lower[fixed] <= at) & (at <= upper[fixed]))
-        if not inside or _misses(lower, upper).any():
+        outside = np.maximum(lower[fixed] - at, at - upper[fixed])
+        room = np.maximum(abs(lower[fixed]), abs(upper[fixed]))
+        outside = cleaned(outside, abs(at) + np.where(np.isfinite(room), room, 0.0))
+        if np.any(outside > 0) or _misses(lower, upper).any():
             return _empty_box(len(rest))
         return Box(lower[rest], upper[rest])
 

@@ -101,6 +101,7 @@ def hull(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     tied = np.setdiff1d(np.arange(n), free)
     C = basis[tied] @ np.linalg.pinv(basis[free]) if rank else np.zeros((n, 0))
     C = np.where(np.abs(C) <= 1e-13, 0.0, C)
+    C, through_zero = _through_zero(points / scale, free, tied, C)
     E = np.zeros((len(tied), n))
     E[np.arange(len(tied)), tied] = 1.0
     E[:, free] = -C
@@ -110,7 +111,26 @@ def hull(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         normals = np.zeros((len(inner), n))
         normals[:, free] = inner
     H = np.vstack([E, -E, normals])
-    return _unscaled(H, np.concatenate([np.zeros(2 * len(E)), offsets]), scale, center)
+    H, h = _unscaled(H, np.concatenate([np.zeros(2 * len(E)), offsets]), scale, center)
+    h[: 2 * len(E)][np.tile(through_zero, 2)] = 0.0
+    return H, h
+
+
+def _through_zero(
+    points: np.ndarray, free: np.ndarray, tied: np.ndarray, C: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return C with x_tied = C x_free for coordinates of which this holds to rounding, and which.
+
+    Of points D times as far off as they are wide, a plane is known to rounding times D in slope,
+    and where it meets the axes to D²: a side that should be 0 is not rounding of its own terms."""
+    x, y = points[:, free], points[:, tied]
+    slope = np.linalg.lstsq(x, y, rcond=None)[0].T if len(free) else np.zeros(C.shape)
+    rounding = 16 * np.finfo(float).eps
+    seen = np.abs(slope) * np.abs(x).max(axis=0) > rounding * np.abs(y).max(axis=0)[:, None]
+    slope = np.where(seen, slope, 0.0)
+    terms = np.abs(y) + np.abs(x) @ np.abs(slope).T
+    found = np.all(np.abs(y - x @ slope.T) <= rounding * terms, axis=0)
+    return np.where(found[:, None], slope, C), found
 
 
 def hull_of_sums(V: np.ndarray, W: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

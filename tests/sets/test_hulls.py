@@ -4,6 +4,7 @@ volume is the product of two areas."""
 import numpy as np
 import pytest
 
+import jaxmpc as jm
 from jaxmpc.feasible.hull_labels import hull_facets
 from jaxmpc.sets.geometry import hull_volume
 
@@ -51,3 +52,38 @@ def test_points_in_a_hyperplane_have_no_volume():
     flat = rng.normal(size=(30, 3)) @ rng.normal(size=(3, 4))
     assert hull_volume(flat) == 0
     assert hull_volume(np.ones((9, 3))) == 0
+
+
+@pytest.mark.parametrize("far", [10.0, 100.0, 1e3, 1e4])
+def test_flat_images_far_out_keep_their_dimensions(far):
+    """The same output in two units beside another one, of polygons far from the origin: a plane
+    through 0, of which hulls know the slopes to rounding times the distance alone."""
+    rng = np.random.default_rng(0)
+    for _ in range(30):
+        corners = rng.normal(size=(6, 2)) + far * rng.normal(size=2)
+        M = rng.normal(size=(2, 2))
+        M = 10.0 ** rng.integers(-6, 7, (3, 1)) * M[[0, 0, 1]]
+        V = corners @ M.T
+        flat, shadow = jm.Polytope.from_points(V), jm.Polytope.from_points(V[:, [0, 2]])
+        assert flat.affine_dimension() == 2
+        assert len(flat.vertices()) == len(shadow.vertices())
+        np.testing.assert_allclose(flat.support(np.eye(3)), V.max(axis=0), rtol=1e-12)
+        assert flat.project([0, 2]).volume() == pytest.approx(shadow.volume(), rel=1e-5)
+        segment = jm.Polytope.from_points(V[:1] * np.array([[1.0], [1 + 1 / far]]))
+        assert segment.affine_dimension() == 1 and len(segment.vertices()) == 2
+
+
+def test_boxes_and_polytopes_of_the_same_sums_are_the_same():
+    """({x} + Q) − Q is {x}, and a section at a bound that is a sum is there, to rounding."""
+    rng = np.random.default_rng(1)
+    for _ in range(200):
+        x, sides = rng.normal(size=2), np.sort(rng.normal(size=(2, 2)), axis=0)
+        point, Q = jm.Box(x, x), jm.Box(*sides)
+        left = (point + Q) - Q
+        assert not left.is_empty()
+        np.testing.assert_allclose(left.lower, x, rtol=0, atol=1e-14)
+    assert not (jm.Box([0.1], [0.3]) - jm.Box([0.0], [0.2])).is_empty()
+    assert (jm.Box([0.1], [0.3]) - jm.Box([0.0], [0.2 + 1e-12])).is_empty()
+    for kind in (jm.Box, lambda *sides: jm.Box(*sides).to_polytope()):
+        assert not kind([0, 0.3], [1, 0.3]).slice({1: 0.1 + 0.2}).is_empty()
+        assert kind([0, 0.3], [1, 0.3]).slice({1: 0.3 + 1e-9}).is_empty()
