@@ -180,7 +180,10 @@ int NAME_step(NAME_memory *memory, const real x[N], const real *state_reference,
   real sum = 0;
 
   for (int i = 0; i < N; i++) sum += FABS(theta[i] = x[i]);
-  for (int i = N; i < NP; i++) theta[i] = clipped(i - N, memory->u[i - N]); /* input rates */
+  for (int i = N; i < NP; i++) { /* input rates, from a last input that may lie beyond the limits */
+    real last = memory->u[i - N];
+    theta[i] = isfinite(last) ? last : clipped(i - N, last);
+  }
   for (int i = 0; i < N && state_reference; i++) sum += FABS(state_reference[i]);
   for (int i = 0; i < MU && input_reference; i++) sum += FABS(input_reference[i]);
   if (!isfinite(sum)) return failed(NAME_NON_FINITE, memory, input, info);

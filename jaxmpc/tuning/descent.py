@@ -228,10 +228,16 @@ def descend(
         remove_partial(path)
     if path is not None and path.exists():
         state = _load_checkpoint(path, theta, optimizer, mark)
-        first, now = state.checks[0]["loss"], _checked(validate, theta)["loss"]
-        if not np.isclose(now, first, rtol=1e-4, atol=0):
-            problem = f"began with the validation loss {first:.9g}, which is {now:.9g} now"
-            fail(str(path), problem, "Give it the same data, loss, plant and solver, or remove it")
+        # Another loss or plant may have the same value at the start.
+        kept = [t for t, check in enumerate(state.checks) if check]
+        losses = np.array([state.checks[t]["loss"] for t in kept], float)
+        best = kept[int(np.argmin(np.nan_to_num(losses, nan=np.inf)))]
+        for t in dict.fromkeys((0, best, kept[-1])):
+            before, now = state.checks[t]["loss"], _checked(validate, state.thetas[t])["loss"]
+            if not np.isclose(now, before, rtol=1e-4, atol=0, equal_nan=True):
+                problem = f"had the validation loss {before:.9g} after {t} steps, now {now:.9g}"
+                cure = "Give it the same data, loss, plant and solver, or remove it"
+                fail(str(path), problem, cure)
     begun = time.perf_counter()
     with tqdm(total=updates, unit=" steps", disable=not settings.progress) as bar:
         bar.set_postfix_str("compiling")

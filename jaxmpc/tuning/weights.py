@@ -298,6 +298,8 @@ class Loops:
             settings = replace(settings, checkpoint=path.with_stem(f"{path.stem}-{number}"))
         decides = settings.decides(parameters, self.train, self.test)
         decides |= {"steps": objective.steps, "dtype": self.dtype}
+        if self.mode in ("sampling", "gauss-newton"):  # all others follow the gradient
+            decides["slope"] = self.mode
         optimizer = optax.sgd(1.0) if self.mode == "gauss-newton" else optax.adam(0.05)
         start = raw(parameters)
         history = descend(start, self.gradient, self.validate, optimizer, settings, decides)

@@ -90,8 +90,8 @@ int main(int count, char **arguments) {
     }
     real before[MU]; /* what the code takes for the last input */
     for (int i = 0; i < MU; i++) {
-      before[i] = isfinite(memory.u[i]) ? memory.u[i] : 0;
-      before[i] = fmax(fmin(before[i], input_upper[i]), input_lower[i]);
+      real none = fmax(fmin((real)0, input_upper[i]), input_lower[i]);
+      before[i] = isfinite(memory.u[i]) ? memory.u[i] : none;
     }
     const real *a = references ? xr : NULL, *b = references ? ur : NULL;
     int status = law_step(&memory, x, a, b, u, &info);
@@ -100,6 +100,8 @@ int main(int count, char **arguments) {
       beyond += u[i] < input_lower[i] || u[i] > input_upper[i];
 #if law_RATES
       real step = u[i] - before[i], ulp = 4 * (real)1e-7;
+      if (before[i] + rate_upper[i] < input_lower[i] || before[i] + rate_lower[i] > input_upper[i])
+        continue; /* no input keeps both limits */
       beyond += step < rate_lower[i] * (1 + ulp) || step > rate_upper[i] * (1 + ulp);
 #endif
     }

@@ -98,6 +98,8 @@ class Compiled:
             if line.startswith("#define")
         )  # fmt: skip
         self.m, self.dtype = int(sizes[f"{name}_INPUTS"]), np.dtype(dtype)
+        held = [int(sizes[f"{name}_{what}"]) for what in ("VARIABLES", "ROWS", "PARAMETERS")]
+        self.last = sum(held) + 1  # where memory.u begins
         strict = "-std=c99 -O2 -Wall -Wextra -Wpedantic -Werror -shared -fPIC".split()
         library = folder / f"{name}.so"
         subprocess.run([CC, *strict, folder / f"{name}.c", "-lm", "-o", library], check=True)
@@ -171,6 +173,21 @@ def test_status_is_true_and_bad_states_are_answered(tmp_path):
         u, status = code.step([bad, 0.0])
         assert status == 3 and u == 0
     assert code.step([0.2, -0.1])[1] == 1  # from a cold start again
+
+
+@compiled
+def test_rates_count_from_a_last_input_beyond_the_limits(tmp_path):
+    """With inputs of at most 1 and rates of 0.3 the next is 0.9 after 1.2, and none after 1.6."""
+    system = jm.LinearSystem([[1, 0.1], [0, 1]], [[0.005], [0.1]])
+    mpc = jm.MPC(system, [10.0, 1], [0.1], 5, inputs=jm.Box([-1.0], [1.0]), input_rate_limit=[0.3])
+    code, law = Compiled(mpc, jm.ADMM(500, newton_steps=0), tmp_path), jm.Controller(mpc)
+    for last, expected in ((1.0, 0.7), (1.2, 0.9), (1.6, None)):
+        code.memory[:] = 0
+        code.memory[code.last] = last
+        u, status = code.step([0.5, 0.0])
+        plan = law(np.array([0.5, 0.0]), previous_input=np.array([last])).plan
+        assert (status == 1) == bool(plan.solved) == (expected is not None)
+        assert expected is None or u == pytest.approx([expected], abs=1e-6)
 
 
 @compiled

@@ -199,8 +199,12 @@ def test_checkpoints_that_do_not_fit(tmp_path):
         bowl(3, checkpoint=path, decides=DECIDES, optimizer=optax.sgd(0.1))
     with pytest.raises(ValueError, match="another optimizer"):  # as many numbers, another step
         bowl(3, checkpoint=path, decides=DECIDES, optimizer=optax.adam(0.2))
-    with pytest.raises(ValueError, match=r"began with the validation loss 14, which is 28 now"):
+    with pytest.raises(ValueError, match=r"had the validation loss 14 after 0 steps, now 28"):
         other = lambda theta: (2 * distance(theta), {})
+        descend(START, slope, other, optax.adam(0.3), Settings(3, checkpoint=path), DECIDES)
+    with pytest.raises(ValueError, match=r"had the validation loss .* after 3 steps, now 0"):
+        # The same at the start alone, as a penalty of what the start does not violate.
+        other = lambda theta: (distance(theta) * (theta["b"].item() == START["b"]), {})
         descend(START, slope, other, optax.adam(0.3), Settings(3, checkpoint=path), DECIDES)
     whole = path.read_bytes()
     for damaged in (b"nothing", whole[: len(whole) // 2], b""):
