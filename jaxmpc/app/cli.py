@@ -2,6 +2,7 @@
 
 import _thread
 import contextlib
+import errno
 import importlib
 import inspect
 import io
@@ -160,9 +161,12 @@ def run(options: Any, argv: Sequence[str]) -> Outcome:
         return Outcome(without_reader())
     except (ValueError, OSError, MemoryError, ImportError) as error:
         message = str(error)
-        if isinstance(error, OSError) and error.filename is None and error.strerror:
+        if isinstance(error, OSError) and error.strerror:
+            full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
             resuming = ", and go on with --resume" if options.keeps else ""
-            message = f"writing: {error.strerror}. Make room where it is written to{resuming}"
+            cure = "Make room where it is written to" + resuming
+            cure = cure if full else "Give files and folders that are there and can be written"
+            message = f"{error.filename or 'writing'}: {error.strerror}. {cure}"
         return Outcome(report_error(named_options(message, options)))
     except KeyboardInterrupt:
         if not options.keeps:

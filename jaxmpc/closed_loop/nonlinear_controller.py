@@ -262,11 +262,11 @@ def at_rest(mpc: MPC, xi: Array, input_reference: Any) -> tuple[Array, Array]:
 
 
 def last_input(mpc: MPC, before: Control[Plan] | None, previous_input: Any) -> Array | None:
-    """Return the input (m,) before a time step, within the limits: the given one, or that of
-    `before`; None where neither is known."""
+    """Return the input (m,) before a time step: the given one, or that of `before`; None where
+    neither is known, and one within the limits where it is not finite."""
     if previous_input is None:
         if before is None:
             return None
         previous_input = before.u
     u = jnp.asarray(previous_input)
-    return limited(mpc.inputs, jnp.where(jnp.isfinite(u), u, 0.0))
+    return jnp.where(jnp.isfinite(u), u, limited(mpc.inputs, jnp.zeros_like(u)))

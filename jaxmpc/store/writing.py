@@ -598,7 +598,10 @@ def require_removable(path: str | Path) -> Path:
     metadata = [path / "zarr.json", *path.glob("*/zarr.json")]
     if not any(file.is_file() for file in metadata):
         fail(str(path), "is no sweep store", "Choose another output folder")
+    # A store holds arrays alone, of which each is its metadata and its chunks.
     foreign = [v.name for v in path.iterdir() if not v.is_dir() and v.name != "zarr.json"]
+    inside = (part for v in path.iterdir() if v.is_dir() for part in v.iterdir())
+    foreign += [f"{v.parent.name}/{v.name}" for v in inside if v.name not in ("zarr.json", "c")]
     if foreign:
         fail(str(path), f"holds {foreign[0]}, which is of no store", "Choose another output folder")
     return path

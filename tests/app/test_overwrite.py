@@ -104,6 +104,25 @@ def test_a_linked_store_is_not_deleted(folder, tmp_path, capsys):
     assert "is a link to" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("where", ["sweep.zarr", "sweep.zarr/plan", "sweep.zarr/new/one"])
+def test_nothing_is_written_into_a_store(folder, where, capsys):
+    before = contents(folder)
+    assert cli.main([*LINE, str(folder / where)]) == 2
+    assert "lies in the store" in capsys.readouterr().err
+    assert contents(folder) == before
+
+
+@pytest.mark.parametrize("where", ["new/results.txt", "plan/notes.txt"])
+def test_a_store_with_files_of_others_is_not_deleted(folder, where, capsys):
+    other = folder / "sweep.zarr" / where
+    other.parent.mkdir(exist_ok=True)
+    other.write_text("mine")
+    before = contents(folder)
+    assert cli.main([*LINE, str(folder), "--overwrite"]) == 2
+    assert f"holds {where}, which is of no store" in capsys.readouterr().err
+    assert contents(folder) == before
+
+
 def test_resume_with_other_options_deletes_nothing(folder):
     before = contents(folder)
     assert cli.main([*LINE, str(folder), "--resume", "--horizon", "5"]) == 2
