@@ -78,16 +78,17 @@ def render(
         if camera != "view":
             fail("camera", f"the model has none named {camera!r}", "Give one of its, or None")
         view = None
-    poses = motions[:, :: max(1, samples // 20), : model.nq].reshape(-1, model.nq)
+    drawn = motions[:, ::every, : model.nq]
+    poses = drawn.reshape(-1, model.nq)
     poses = poses if ghosts is None else np.concatenate([poses, ghosts])
     ends = _ends(model, poses)
     if view is None:
         view = _camera(model, ends, width / height)
-    floor = None if np.any(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE) else ends
+    planes = _visible(model) & (model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
+    floor = None if np.any(planes) else ends
     columns = int(np.ceil(np.sqrt(count)))
     rows = -(-count // columns)
     tiles = [(height * (i // columns), width * (i % columns)) for i in range(count)]
-    drawn = motions[:, ::every, : model.nq]
     film = np.full((drawn.shape[1], rows * height, columns * width, 3), 255, np.uint8)
     with _renderer(model, width, height) as renderer:
         for (top, left), motion in zip(tiles, drawn, strict=True):
@@ -139,7 +140,9 @@ def _checked(
 
 
 def _drawn(model: "mujoco.MjModel", width: int, height: int) -> "mujoco.MjModel":
-    """Return a copy of a model with room for pictures of this size, and light enough."""
+    """Return a copy of a model with room for pictures of this size, light enough, seen in
+    perspective, and with the hidden shapes of bodies that have no others, such as those for
+    collisions beside a mesh that is missing."""
     model = copy.deepcopy(model)
     buffer, light = model.vis.global_, model.vis.headlight
     buffer.offwidth, buffer.offheight = max(buffer.offwidth, width), max(buffer.offheight, height)
@@ -148,7 +151,20 @@ def _drawn(model: "mujoco.MjModel", width: int, height: int) -> "mujoco.MjModel"
     if not model.nlight:
         light.ambient[:] = np.maximum(light.ambient, 0.6)
         light.diffuse[:] = np.maximum(light.diffuse, 0.6)
+    if buffer.orthographic:  # then fovy is a length
+        buffer.orthographic, buffer.fovy = 0, 45
+    seen = np.bincount(model.geom_bodyid[_visible(model)], minlength=model.nbody) > 0
+    shown = ~seen[model.geom_bodyid] & (model.body_weldid[model.geom_bodyid] != 0)
+    model.geom_group[shown], model.geom_matid[shown], model.geom_rgba[shown, 3] = 0, -1, 1.0
     return model
+
+
+def _visible(model: "mujoco.MjModel") -> np.ndarray:
+    """Return which shapes MuJoCo draws unless told otherwise: of groups 0 to 2, not transparent."""
+    alpha, material = model.geom_rgba[:, 3], model.geom_matid
+    if model.nmat:
+        alpha = np.where(material >= 0, model.mat_rgba[material, 3], alpha)
+    return (model.geom_group < 3) & (alpha > 0)
 
 
 def _renderer(model: "mujoco.MjModel", width: int, height: int) -> "mujoco.Renderer":
@@ -330,8 +346,9 @@ def save_video(path: str | Path, frames: Any, fps: float) -> None:
         jm.robots.save_video("arm.gif", frames, fps=1 / robot.dt)
 
     GIF needs nothing more; MP4 needs imageio with ffmpeg, `pip install "imageio[ffmpeg]"`, which no
-    extra of jaxmpc brings along. fps: frames a second; GIF rounds the time of a
-    frame to 10 ms and joins frames that are equal.
+    extra of jaxmpc brings along. fps: frames a second. A GIF begins its frames at
+    whole hundredths of a second, leaves those out that would be seen for less than two of these,
+    and joins frames that are equal.
     Raises ValueError for other endings and frames, and where .mp4 cannot be written.
     """
     if not isinstance(path, str | Path):
@@ -368,6 +385,14 @@ def write_gif(file: Any, frames: np.ndarray, fps: float) -> None:
     """Write frames to a path or an open file, as a GIF that starts again at its end."""
     from PIL import Image
 
+    # Times are whole hundredths of a second, and viewers take less than two of them for ten.
+    starts = np.round(np.arange(len(frames) + 1) * 100 / fps).astype(int)
+    kept = [0]
+    for k in range(1, len(frames)):
+        if starts[k] >= starts[kept[-1]] + 2:
+            kept.append(k)
+    hundredths = np.append(np.diff(starts[kept]), max(starts[-1] - starts[kept[-1]], 2))
+    frames = frames[kept]
     # One palette for all frames: with one each, colours flicker.
     sheet = Image.fromarray(frames[:: max(1, len(frames) // 8)].reshape(-1, *frames.shape[2:]))
     palette = sheet.quantize(256)
@@ -375,8 +400,8 @@ def write_gif(file: Any, frames: np.ndarray, fps: float) -> None:
         Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE)
         for frame in frames
     )
-    milliseconds = max(10, 10 * round(100 / fps))
-    first.save(file, format="GIF", save_all=True, append_images=rest, duration=milliseconds, loop=0)
+    times = (10 * hundredths).tolist()
+    first.save(file, format="GIF", save_all=True, append_images=rest, duration=times, loop=0)
 
 
 def captioned(

@@ -453,3 +453,55 @@ def test_numbers_of_a_robot_do_not_depend_on_how_many_there_are():
     assert few[1].keys() == many[1].keys() == {"mass", "damping", "payload"}
     for name, value in few[1].items():
         np.testing.assert_array_equal(value, many[1][name][:5])
+
+
+@pytest.mark.parametrize("dt", [0.002, 0.004, 0.01, 0.0125, 0.015, 0.025, 0.03, 0.2])
+def test_gifs_last_as_long_as_the_motion(dt, tmp_path):
+    """Viewers take frames of less than 20 ms for such of 100."""
+    frames = np.arange(40, dtype=np.uint8)[:, None, None, None] * np.full((1, 4, 5, 3), 6, np.uint8)
+    save_video(tmp_path / "film.gif", frames, 1 / dt)
+    with Image.open(tmp_path / "film.gif") as film:
+        times = [(film.seek(k), film.info["duration"])[1] for k in range(film.n_frames)]
+    assert min(times) >= 20 and sum(times) == pytest.approx(1000 * 40 * dt, abs=20)
+
+
+UNSEEN = """
+import sys
+import numpy as np
+from jaxmpc.app.commands.simulate import choose_renderer
+choose_renderer()
+import mujoco
+import jaxmpc as jm
+FILE = '''<mujoco><visual><global %s/></visual><worldbody><body><joint name="q" type="slide"
+axis="1 0 0"/><geom %s size="0.1" rgba="0 1 0 %s" mass="1"/></body></worldbody>
+<actuator><motor joint="q" ctrlrange="-1 1"/></actuator></mujoco>'''
+t = 0.01 * np.arange(100)
+for option, shape, alpha, motion in (
+    ("", 'group="3"', 1, t),
+    ("", "", 0, t),
+    ('orthographic="true" fovy="2"', "", 1, t),
+    ("", "", 1, 0.5 * np.sin(2 * np.pi * 20 * t + 1)),  # every fifth sample is the same
+    ("", "", 1, np.where(t > 0.955, 90 * (t - 0.955), 0.0)),
+):
+    robot = jm.load_robot(mujoco.MjModel.from_xml_string(FILE % (option, shape, alpha)))
+    states = np.column_stack([motion, 0 * motion])
+    try:
+        frames = jm.robots.render(robot, states, labels=False, width=80, height=60).astype(int)
+    except RuntimeError as error:
+        print(error, file=sys.stderr)
+        sys.exit(3)
+    print(int((frames[..., 1] > frames[..., 0] + 40).sum(axis=(1, 2)).min()))
+"""
+
+
+@pytest.mark.slow
+def test_films_show_the_robot_in_every_frame():
+    """Shapes for collisions alone, transparent ones, orthographic views, and motions that are fast
+    beside the film's frames."""
+    paths = {**os.environ, "PYTHONPATH": str(Path(jm.__file__).parents[1])}
+    done = subprocess.run([sys.executable, "-c", UNSEEN], capture_output=True, text=True, env=paths)
+    if done.returncode == 3:
+        pytest.skip(done.stderr.splitlines()[-1])
+    assert done.returncode == 0, done.stderr
+    least = [int(line) for line in done.stdout.split()]
+    assert len(least) == 5 and min(least) >= 5, least
