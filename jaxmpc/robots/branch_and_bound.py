@@ -1,7 +1,7 @@
 """Bounds of what a linear model of accelerations leaves out, by branch and bound.
 
-A cell of states and inputs is taken together with all places where the robot can be within a
-control period from there: a guess of the accelerations gives these places, and holds if the
+A cell of states and inputs is taken together with all places where the robot can be when a physics
+step of its control period begins: a guess of the accelerations gives these places, and holds if the
 accelerations there lie within the guess. Cells are halved until their bounds are within a tolerance
 of values that samples have.
 """
@@ -40,7 +40,9 @@ class Search:
         self.dynamics, self.slope = dynamics, slope
         self.least, self.most = values.min(axis=0), values.max(axis=0)
         self.slack = tolerance * (self.most - self.least)
-        self.dt = dynamics.robot.dt
+        # From the first to the last physics step of a period: where accelerations are taken.
+        robot = dynamics.robot
+        self.dt = robot.dt * (robot.substeps - 1) / robot.substeps
         n, low, high = dynamics.robot.n, dynamics.lower - dynamics.z, dynamics.upper - dynamics.z
         A, B, _, _ = powers(dynamics.robot, slope)
         T = np.hstack([(A.lower + A.upper) / 2, (B.lower + B.upper) / 2])
@@ -53,9 +55,10 @@ class Search:
         cells."""
         dynamics = self.dynamics
         lower, upper = dynamics.lower[None], dynamics.upper[None]
-        # The accelerations (cells, nv) that a cell is taken to have within a period.
-        push = self._start(lower, upper)
         zeros = np.zeros(dynamics.nv)
+        # The accelerations (cells, nv) that a cell is taken to have within a period: NaN where
+        # there is no guess yet.
+        push = Interval(np.nan + zeros[None], np.nan + zeros[None])
         bounds, count = Interval(zeros, zeros), 0
         while len(lower):
             count += len(lower)
@@ -85,12 +88,6 @@ class Search:
             lower, upper, near = self._narrowed(lower, upper)
             lower, upper, push = lower[near], upper[near], push[near]
         return bounds, count
-
-    def _start(self, lower: np.ndarray, upper: np.ndarray) -> Interval:
-        """Return a guess of the accelerations within a period."""
-        reach = np.maximum(np.abs(lower - self.dynamics.z), np.abs(upper - self.dynamics.z))
-        most = reach @ np.abs(self.slope).T + np.maximum(np.abs(self.least), np.abs(self.most))
-        return Interval(-2 * most, 2 * most)
 
     def _narrowed(
         self, lower: np.ndarray, upper: np.ndarray
@@ -130,7 +127,8 @@ class Search:
         swept, middle = self._swept(lower, upper, push), (lower + upper) / 2
         found, lost = D.on_cells(swept, middle)
         of, acceleration, score = self._polynomials(found, swept, middle, half)
-        # The guess of the accelerations must hold those that follow from it.
+        # The guess of the accelerations must hold those that follow from it; those of the cell
+        # itself make the first one.
         kept = (push.lower <= acceleration.lower) & (acceleration.upper <= push.upper)
         again = ~lost & ~kept.all(axis=1)
         bad = lost | again
@@ -139,9 +137,9 @@ class Search:
         guess = Interval(acceleration.lower - room, acceleration.upper + room)
         # A guess that outgrows the one before by far leads nowhere: the cell is too large, as is
         # one without bounds. Such cells are halved where they are widest, of the whole box.
-        outgrown = (guess.upper - guess.lower > 4 * (push.upper - push.lower)).any(axis=1) & again
+        outgrown = (guess.upper - guess.lower > 2 * (push.upper - push.lower)).any(axis=1) & again
         large = lost | outgrown
-        guess.lower[large], guess.upper[large] = push.lower[large], push.upper[large]
+        guess.lower[large] = guess.upper[large] = np.nan
         relative = half / np.maximum(D.upper - D.lower, np.finfo(float).tiny)
         split = np.where(large, relative.argmax(axis=1), score.argmax(axis=1))
         return of, guess, split, swept[:, : D.nv], again & ~outgrown
@@ -150,6 +148,7 @@ class Search:
         """Return where the robot is within a period that begins in a cell (cells, d), under
         accelerations in push: v + [0, dt] a, then q + [0, dt] v."""
         nv, swept = self.dynamics.nv, Interval(lower.copy(), upper.copy())
+        push = push.mapped(np.nan_to_num)
         q, v = slice(0, nv), slice(nv, 2 * nv)
         swept[:, v] = add(swept[:, v], _moved(push, self.dt))
         swept[:, q] = add(swept[:, q], _moved(swept[:, v], self.dt))

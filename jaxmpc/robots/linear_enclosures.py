@@ -89,8 +89,8 @@ def linear_enclosure(
     plant's program (1e-16 of its numbers in float64, 1e-7 in float32) are not in them. Computed
     outside JAX in float64, rounded outward; not traceable.
 
-    Raises ValueError for robots that are more than a tree of hinges and slides with motors and
-    dampers (contacts, couplings, dry friction, tendons, force limits, quaternions, activations,
+    Raises ValueError for robots that are more than a tree of hinges and slides with motors, servos
+    and dampers (contacts, couplings, dry friction, tendons, force limits, quaternions, activations,
     integrator RK4), for unbounded boxes or such without the set-point, and where the robot can
     reach the end of a joint's range within a period.
     """

@@ -5,6 +5,7 @@ in place of numbers: value, gradient and Hessian, each an interval that holds th
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -257,6 +258,17 @@ def _larger(a: Taylor | np.ndarray, b: Taylor | np.ndarray, sign: float = 1.0, *
     return x  # type: ignore[return-value]
 
 
+def _compared(
+    a: Taylor | np.ndarray, b: Taylor | np.ndarray, compare: Callable[..., np.ndarray], **_: Any
+) -> np.ndarray:
+    """Return what a comparison with infinite limits says of all numbers."""
+    sides = [np.zeros(v.shape) if isinstance(v, Taylor) else v for v in (a, b)]
+    limit = b if isinstance(a, Taylor) else a
+    if isinstance(limit, Taylor) or not np.all(np.isinf(limit)):
+        fail("robot", "its program compares results", "Take a model without limits of forces")
+    return compare(*sides)
+
+
 def _contracted(
     a: Taylor | np.ndarray, b: Taylor | np.ndarray, dimension_numbers: Any, **_: Any
 ) -> Any:
@@ -267,12 +279,19 @@ def _contracted(
     return product.summed(axes) if axes else product
 
 
-RULES: dict[str, Callable[..., Taylor]] = {
+RULES: dict[str, Callable[..., Any]] = {
     **{"add": _sum, "add_any": _sum, "sub": _difference, "mul": _product, "div": _quotient},
     **{"neg": lambda x, **_: -x, "square": lambda x, **_: x * x, "integer_pow": _power},
     **{"cos": _cosine, "sin": _sine, "sqrt": _root, "convert_element_type": _converted},
     "rsqrt": lambda x, **_: _root(x).inverted(),
     **{"max": _larger, "min": lambda a, b, **_: _larger(a, b, -1.0)},
+    **{
+        name: partial(_compared, compare=compare)
+        for name, compare in (
+            *(("gt", np.greater), ("ge", np.greater_equal), ("eq", np.equal)),
+            *(("lt", np.less), ("le", np.less_equal), ("ne", np.not_equal)),
+        )
+    },
     "reduce_sum": lambda x, axes, **_: x.summed(axes),
     "dot_general": _contracted,
 }

@@ -123,7 +123,7 @@ def test_programs_that_decide_are_refused():
     with pytest.raises(ValueError, match="rounds to whole numbers"):
         program = TaylorProgram(lambda x: x.astype(int) + x, (1,))
         program(intervals.point([[0.5]]), np.array([[0.5]]))
-    with pytest.raises(ValueError, match="the operation gt"):
+    with pytest.raises(ValueError, match="its program compares results"):
         program = TaylorProgram(lambda x: jnp.where(x > 0, x, 2 * x), (1,))
         program(intervals.point([[0.5]]), np.array([[0.5]]))
 
@@ -210,6 +210,41 @@ def test_proved_states_keep_their_limits_on_the_plant(pendulum):
             assert np.all(np.abs(x) <= HALF + 1e-9) and np.all(np.abs(u) <= 5 + 1e-6)
             x = np.asarray(step(x, u))
             assert k < 20 or np.all(mpc.terminal_set.contains(x, 1e-6))
+
+
+SERVOS = {
+    "position": ('<position joint="j" kp="20" kv="2" ctrlrange="-1 1"/>', 0.01),
+    "velocity": ('<velocity joint="j" kv="2" ctrlrange="-1 1"/>', 0.01),
+    "ten steps": ('<position joint="j" kp="5" kv=".3" ctrlrange="-1 1"/>', 0.02),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", SERVOS)
+def test_servos_stay_inside(kind):
+    """Of stiff ones too, which change the speed by two thirds within a period: their accelerations
+    are those at the beginnings of physics steps. The plant is MuJoCo's C engine."""
+    servo, period = SERVOS[kind]
+    text = BODY.format(joint='damping=".1"', motor=servo, geom=FREE, more="")
+    model = mujoco.MjModel.from_xml_string(text)
+    model.opt.timestep = period / 10 if kind == "ten steps" else period
+    robot = jm.load_robot(model, control_period=period)
+    half = np.array([0.3, 1.0])
+    found = jm.robots.linear_enclosure(robot, jm.Box(-half, half), tolerance=0.1, cells=2000)
+    assert kind == "ten steps" or np.all(found.left_out.upper < 1.3 * found.found.upper)
+    rng, data = np.random.default_rng(5), mujoco.MjData(model)
+    part = rng.uniform(-1, 1, (4000, 3))
+    part = np.where(rng.uniform(size=part.shape) < 0.5, np.sign(part), part)
+    x, u = part[:, :2] * half, part[:, 2:]
+    after = x @ found.system.A.T + u @ found.system.B.T + found.system.c
+    allowed = np.all(np.abs(after) <= half, axis=1)
+    assert allowed.sum() > 200
+    for state, ctrl, predicted in zip(x[allowed], u[allowed], after[allowed], strict=True):
+        data.qpos[:], data.qvel[:], data.ctrl[:] = state[:1], state[1:], ctrl
+        mujoco.mj_step(model, data, robot.substeps)
+        w = np.concatenate([data.qpos, data.qvel]) - predicted
+        assert np.all(w <= found.disturbance.upper + 1e-12)
+        assert np.all(w >= found.disturbance.lower - 1e-12)
 
 
 def refused(robot, match, **given):
