@@ -115,6 +115,12 @@ def test_targets_of_tasks_stand_behind_the_reference():
         np.testing.assert_allclose(plan.inputs, other.inputs, atol=1e-6)
 
 
+def test_lists_of_tasks_are_arrays_inside_loops_too():
+    task = Task(lambda at: at.x, [5.0, 1.0], [0.1, 0], lower=[-9, -9.0], upper=[9, 9])
+    assert all(np.asarray(v).dtype == float for v in (task.target, task.upper))
+    jax.eval_shape(lambda traced: traced.validate(2, 5), task)
+
+
 class Learned(eqx.Module):
     """A model of a cart with a network for what pushes it; its functions are leaves."""
 

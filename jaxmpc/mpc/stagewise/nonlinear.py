@@ -22,6 +22,7 @@ import numpy as np
 from jax import Array
 from jax.typing import DTypeLike
 
+from jaxmpc.arrays import store_floats
 from jaxmpc.checks import (
     concrete,
     fail,
@@ -74,6 +75,7 @@ class Task:
         if callable(self.function):
             object.__setattr__(self, "function", as_argument(self.function))
         store_stages(self, "stages")
+        store_floats(self, "weight", "target", "lower", "upper", "rho")
 
     @property
     def limited(self) -> bool:
