@@ -25,7 +25,7 @@ def export_jax(
     platforms: tuple[str, ...] = PLATFORMS,
     overwrite: bool = False,
 ) -> Path:
-    """Write the plans of a batch of any size as one file that needs jax alone to run.
+    """Write the plans of a batch of any size from 1 on as one file that needs jax alone to run.
 
         program = jax.export.deserialize(path.read_bytes())
         plan = program.call(x0s, references, input_references)
