@@ -50,10 +50,8 @@ def differing():
 def robust(policy, **changes):
     """The pendulum, in deviations from where it stands, under disturbances of one state."""
     law = jm.LinearSystem(pendulum().system.A, pendulum().system.B)
-    return pendulum(
-        system=law, policy=policy, disturbance=jm.Box(-0.02, 0.03),
-        disturbance_matrix=[[1.0], [0.5]], horizon=3, **changes,
-    )  # fmt: skip
+    given = {"disturbance": jm.Box(-0.02, 0.03), "horizon": 3} | changes
+    return pendulum(system=law, policy=policy, disturbance_matrix=[[1.0], [0.5]], **given)
 
 
 CASES = {
@@ -83,7 +81,7 @@ CASES = {
 # So few steps solve none of their plans.
 POLICIES = {policy: (partial(robust, policy), STEPS) for policy in ("tube", "affine")}
 POLICIES["affine, more"] = partial(
-    robust, "affine", input_rate_limit=0.4, control_horizon=(1, 2),
+    robust, "affine", disturbance=jm.Box(-0.03, 0.03), input_rate_limit=0.4, control_horizon=(1, 2),
     soft=jm.Soft([[1.0, 0.5]], upper=[0.1], rho=2.0),
 ), STEPS  # fmt: skip
 
