@@ -78,8 +78,8 @@ def _limited(joints: tuple[int, ...], limits: Any, n: int) -> Array:
                 H = jnp.any(jnp.asarray(block.H).reshape(-1, block.size, n) != 0, axis=0)
                 found = found | jnp.any(rows[:, None] & H, axis=0)
     elif isinstance(limits, Box):
-        lower, upper = (jnp.asarray(end) for end in limits.bounds())
-        found = jnp.broadcast_to(jnp.isfinite(lower) | jnp.isfinite(upper), (n,))
+        finite = (jnp.isfinite(jnp.asarray(end)) for end in (limits.lower, limits.upper))
+        found = jnp.broadcast_to(next(finite) | next(finite), (n,))
     elif isinstance(limits, Polytope):
         found = jnp.any(jnp.asarray(limits.H) != 0, axis=0)
     for motion in rotations(joints):

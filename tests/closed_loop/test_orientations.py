@@ -105,8 +105,9 @@ def test_rewards_are_stage_costs_beyond_half_a_turn(satellite):
         controller, robot, turned(-3.0), 5, reference=aim, input_reference=np.zeros(3)
     )
     state = environment.at(turned(-3.0))
+    step = jax.jit(Environment.step)
     for u, cost in zip(run.inputs, run.stage_cost, strict=True):
-        state = environment.step(state, u)
+        state = step(environment, state, u)
         assert float(state.reward) == pytest.approx(-float(cost), rel=1e-4)
     loss = jm.tuning.ClosedLoopLoss(controller.mpc.Q, 0.0 * np.eye(3), reference=aim, plant=robot)
     tracked = [
