@@ -220,7 +220,10 @@ def number(argument: str, value: Any, least: float, cure: str) -> None:
 
 def positive(argument: str, value: Any) -> None:
     """Raise unless a readable `value` is one finite number above 0."""
-    number(argument, value, np.finfo(np.float64).tiny, "Give a positive number")
+    cure = "Give a positive number"
+    if isinstance(value, bool):
+        fail(argument, f"{value}", cure)
+    number(argument, value, np.finfo(np.float64).tiny, cure)
     if concrete(value) and np.isinf(value):
         fail(argument, f"{value}", "Give a finite number")
 

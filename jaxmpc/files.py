@@ -230,10 +230,11 @@ def require_new(paths: Sequence[Path], overwrite: bool) -> None:
 def open_folder(path: Path) -> None:
     """Create a folder for results. Raises ValueError where it cannot be written, or lies within a
     store, which is replaced as a whole."""
-    for folder in (path, *path.absolute().parents):
-        if (folder / "zarr.json").is_file():
-            fail(str(path), f"lies in the store {folder}", "Give a folder outside of it")
     try:
+        place = path.resolve()
+        for folder in (place, *place.parents):
+            if (folder / "zarr.json").is_file():
+                fail(str(path), f"lies in the store {folder}", "Give a folder outside of it")
         path.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=path):
             pass

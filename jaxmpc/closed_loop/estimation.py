@@ -445,7 +445,7 @@ class KalmanFilter:
         mean, P = belief
         C = jnp.asarray(self._outputs_of_all(), mean.dtype)
         known, expected = jnp.all(jnp.isfinite(y)), matmul(C, mean)
-        error = jnp.where(known, self._nearest_turns(y, expected), expected) - expected
+        error = self._nearest_turns(jnp.where(known, y, expected), expected) - expected
         if P is None:
             return Belief(mean + matmul(jnp.asarray(self.gain, mean.dtype), error), None)
         V = jnp.asarray(covariance(self.measurement, self.p), mean.dtype)
@@ -493,8 +493,8 @@ class KalmanFilter:
         return Belief(after, matmul(A, matmul(P, A.T)) + W)
 
     def _nearest_turns(self, y: Array, expected: Array) -> Array:
-        """Return the outputs (p,) with rotation vectors that are measured whole, of free bodies and
-        ball joints, as those of the same orientations which are nearest to the expected ones."""
+        """Return the outputs (p,) with rotation vectors of free bodies and ball joints, where rows
+        of C are their coordinates, as those of the same orientations nearest to the expected."""
         model = _robot_model(self.model)
         if model is None:
             return y
@@ -502,9 +502,12 @@ class KalmanFilter:
         for motion in rotations(model.robot.joints):
             places = C[:, None] == jnp.eye(self.model.n, dtype=C.dtype)[motion]
             found = jnp.all(places, axis=2)  # (p, 3)
-            at = jnp.argmax(found, axis=0)
-            nearest = nearest_turns((BALL,), y[at], expected[at])
-            y = y.at[at].set(jnp.where(jnp.all(jnp.any(found, axis=0)), nearest, y[at]))
+            number = jnp.cumsum(found, axis=0)
+            for k in range(1, self.p // 3 + 1):  # the k-th time that it is measured
+                here = found & (number == k)
+                at = jnp.argmax(here, axis=0)
+                nearest = nearest_turns((BALL,), y[at], expected[at])
+                y = y.at[at].set(jnp.where(jnp.all(jnp.any(here, axis=0)), nearest, y[at]))
         return y
 
     def _outputs_of_all(self) -> Any:

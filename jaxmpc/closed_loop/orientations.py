@@ -4,7 +4,8 @@ The coordinates of an orientation are a rotation vector v from home, |v| ≤ π;
 same orientation for every whole number k. Beyond half a turn from home v jumps to the other side:
 from there a plan to a target at +3 rad would turn the longer way, and where noise moves a robot
 across it every plan would begin anew. Plans therefore begin at the vector nearest to the target's,
-and those of references that change are taken on from row to row. Where limits are on a rotation
+and those of references that change are taken on from row to row, as far as three quarters of a turn
+from home. Where limits are on a rotation
 vector, it stays as it is: the shorter way may lead through what they exclude.
 """
 
@@ -15,6 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxmpc.arrays import as_array, dimensions
+from jaxmpc.checks import concrete
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import given_blocks
 from jaxmpc.robots.configurations import nearest_turns, quaternions, rotations
@@ -31,9 +34,10 @@ def rotating_joints(plant: Any) -> tuple[int, ...]:
 
 def aligned(plant: Any, limits: Any, xi: Array, reference: Any) -> tuple[Array, Any]:
     """Return ξ (n,) and the reference (n + …,), or rows of it, with the rotation vectors from which
-    a plan takes the shorter way. limits: an MPC, Box or Polytope; None for none."""
+    a plan takes the shorter way. limits: an MPC, Box or Polytope; None for none. References of
+    other shapes are left to the checks of those who take them."""
     joints, size = rotating_joints(plant), len(xi)
-    if reference is None or not joints:
+    if not joints or not _aligns(reference, size):
         return xi, reference
     fixed, reference = _limited(joints, limits, size), jnp.asarray(reference, xi.dtype)
 
@@ -46,7 +50,11 @@ def aligned(plant: Any, limits: Any, xi: Array, reference: Any) -> tuple[Array, 
     def follow(near: Array, row: Array) -> tuple[Array, Array]:
         return (nearest(row, near),) * 2
 
-    rows = jax.lax.scan(follow, reference[0, :size], reference[:, :size])[1]
+    # From the middle to both ends, for vectors are at most 3π/2 long.
+    rows, middle = reference[:, :size], len(reference) // 2
+    later = jax.lax.scan(follow, rows[middle], rows[middle:])[1]
+    earlier = jax.lax.scan(follow, rows[middle], rows[:middle], reverse=True)[1]
+    rows = jnp.concatenate([earlier, later])
     return nearest(xi, rows[0]), jnp.concatenate([rows, reference[:, size:]], axis=1)
 
 
@@ -54,7 +62,8 @@ def error_of(plant: Any, limits: Any, xi: Array, reference: Array | None) -> Arr
     """Return ξ − reference (n,), rotations the shorter way; reference None for zero."""
     if reference is None:
         return xi
-    xi, reference = aligned(plant, limits, xi, reference[: len(xi)])
+    if np.ndim(reference) == 1:
+        xi, reference = aligned(plant, limits, xi, reference[: len(xi)])
     return xi - reference
 
 
@@ -65,6 +74,14 @@ def host_errors(plant: Any, xi: np.ndarray, reference: np.ndarray) -> np.ndarray
     with jax.enable_x64(True):
         error = jax.vmap(lambda row: error_of(plant, None, row, jnp.asarray(reference)))
         return np.asarray(error(xi.reshape(-1, xi.shape[-1]))).reshape(xi.shape)
+
+
+def _aligns(reference: Any, size: int) -> bool:
+    """Return whether a reference is numbers of the shape (n + …,), or rows of them."""
+    shape = np.shape(as_array(reference)) if dimensions(reference) in (1, 2) else (0,)
+    if shape[-1] < size or 0 in shape:
+        return False
+    return not concrete(reference) or np.asarray(reference).dtype.kind in "biuf"
 
 
 def _limited(joints: tuple[int, ...], limits: Any, n: int) -> Array:

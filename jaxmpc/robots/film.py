@@ -22,6 +22,8 @@ from jaxmpc.sets.limits import row_violations, rows_kept
 # The target has the colour of set-points in the plots; red is for limits alone.
 INK, PAPER, RED, TARGET = (40, 40, 40), (255, 255, 255), (200, 20, 20), (0, 158, 115)
 OPACITY = 0.45  # of the target
+# Hundredths of a second that a GIF can show a frame.
+LONGEST = 2**16 - 1
 # By how much the shapes of the target are thicker: it is seen around a robot that has arrived.
 THICKER = 1.15
 # Colours of capsules in place of shapes, of what a model without a skybox leaves black, and of the
@@ -391,7 +393,11 @@ def write_gif(file: Any, frames: np.ndarray, fps: float) -> None:
     for k in range(1, len(frames)):
         if starts[k] >= starts[kept[-1]] + 2:
             kept.append(k)
+    if len(kept) > 1 and starts[-1] < starts[kept[-1]] + 2:
+        kept.pop()
     hundredths = np.append(np.diff(starts[kept]), max(starts[-1] - starts[kept[-1]], 2))
+    if hundredths.max() > LONGEST:
+        fail("fps", f"{fps}", f"Give at least {100 / LONGEST:.2g}: GIFs have no longer frames")
     frames = frames[kept]
     # One palette for all frames: with one each, colours flicker.
     sheet = Image.fromarray(frames[:: max(1, len(frames) // 8)].reshape(-1, *frames.shape[2:]))

@@ -833,10 +833,12 @@ class Box(LinearSet):
         empty where a value is out of its bounds."""
         lower, upper = self._ends()
         fixed, at, rest = section(values, len(lower))
-        outside = np.maximum(lower[fixed] - at, at - upper[fixed])
-        room = np.maximum(abs(lower[fixed]), abs(upper[fixed]))
-        outside = cleaned(outside, abs(at) + np.where(np.isfinite(room), room, 0.0))
-        if np.any(outside > 0) or _misses(lower, upper).any():
+        # To rounding of each difference by itself: 1e20 may stand for no bound at the other end.
+        outside = [
+            cleaned(sign * (end - at), abs(at) + np.where(np.isfinite(end), abs(end), 0.0)) > 0
+            for sign, end in ((1, lower[fixed]), (-1, upper[fixed]))
+        ]
+        if np.any(outside) or _misses(lower, upper).any():
             return _empty_box(len(rest))
         return Box(lower[rest], upper[rest])
 

@@ -125,7 +125,7 @@ def _through_zero(
     and where it meets the axes to D²: a side that should be 0 is not rounding of its own terms."""
     x, y = points[:, free], points[:, tied]
     slope = np.linalg.lstsq(x, y, rcond=None)[0].T if len(free) else np.zeros(C.shape)
-    rounding = 16 * np.finfo(float).eps
+    rounding = 8 * np.finfo(float).eps
     seen = np.abs(slope) * np.abs(x).max(axis=0) > rounding * np.abs(y).max(axis=0)[:, None]
     slope = np.where(seen, slope, 0.0)
     terms = np.abs(y) + np.abs(x) @ np.abs(slope).T

@@ -3,6 +3,7 @@
 import contextlib
 import math
 import os
+import re
 import shutil
 import sys
 import warnings
@@ -586,6 +587,10 @@ def consolidate(group: "zarr.Group") -> None:
         zarr.consolidate_metadata(group.store)
 
 
+# Files of a store: its metadata, and of each array that and the chunks; parts of what was stopped.
+OF_STORES = re.compile(r"([^/]+/)?zarr\.json|[^/]+/c(/\d+)*|.*\.partial")
+
+
 def require_removable(path: str | Path) -> Path:
     """Return the path of a store, damaged or not, that may be deleted; ValueError where it is none,
     or a link to one: what others have put elsewhere is not deleted."""
@@ -598,12 +603,10 @@ def require_removable(path: str | Path) -> Path:
     metadata = [path / "zarr.json", *path.glob("*/zarr.json")]
     if not any(file.is_file() for file in metadata):
         fail(str(path), "is no sweep store", "Choose another output folder")
-    # A store holds arrays alone, of which each is its metadata and its chunks.
-    foreign = [v.name for v in path.iterdir() if not v.is_dir() and v.name != "zarr.json"]
-    inside = (part for v in path.iterdir() if v.is_dir() for part in v.iterdir())
-    foreign += [f"{v.parent.name}/{v.name}" for v in inside if v.name not in ("zarr.json", "c")]
+    files = (v.relative_to(path).as_posix() for v in path.rglob("*") if not v.is_dir())
+    foreign = next((name for name in files if not OF_STORES.fullmatch(name)), None)
     if foreign:
-        fail(str(path), f"holds {foreign[0]}, which is of no store", "Choose another output folder")
+        fail(str(path), f"holds {foreign}, which is of no store", "Choose another output folder")
     return path
 
 

@@ -234,7 +234,8 @@ def descend(
         best = kept[int(np.argmin(np.nan_to_num(losses, nan=np.inf)))]
         for t in dict.fromkeys((0, best, kept[-1])):
             before, now = state.checks[t]["loss"], _checked(validate, state.thetas[t])["loss"]
-            if not np.isclose(now, before, rtol=1e-4, atol=0, equal_nan=True):
+            rounding = 1e-6 * abs(losses[0])  # of sums that may be near 0 by now
+            if not np.isclose(now, before, rtol=1e-4, atol=rounding, equal_nan=True):
                 problem = f"had the validation loss {before:.9g} after {t} steps, now {now:.9g}"
                 cure = "Give it the same data, loss, plant and solver, or remove it"
                 fail(str(path), problem, cure)

@@ -112,10 +112,10 @@ def test_nothing_is_written_into_a_store(folder, where, capsys):
     assert contents(folder) == before
 
 
-@pytest.mark.parametrize("where", ["new/results.txt", "plan/notes.txt"])
+@pytest.mark.parametrize("where", ["new/results.txt", "plan/notes.txt", "new/c/thesis.txt"])
 def test_a_store_with_files_of_others_is_not_deleted(folder, where, capsys):
     other = folder / "sweep.zarr" / where
-    other.parent.mkdir(exist_ok=True)
+    other.parent.mkdir(parents=True, exist_ok=True)
     other.write_text("mine")
     before = contents(folder)
     assert cli.main([*LINE, str(folder), "--overwrite"]) == 2

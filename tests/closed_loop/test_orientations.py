@@ -138,6 +138,37 @@ def test_limited_rotations_do_not_turn_through_what_is_excluded(satellite):
     np.testing.assert_allclose(aligned(robot, mpc, xi, aim)[0][2], 2 * np.pi - 3, rtol=1e-6)
 
 
+@pytest.mark.parametrize("reference", [np.zeros(2), np.zeros((5, 5)), 1.0, ["a"] * 6])
+@pytest.mark.parametrize("kind", ["state", "nonlinear"])
+def test_wrong_references_are_named(satellite, kind, reference):
+    _, controller, plant = next(each for each in controllers(satellite) if each[0] == kind)
+    x = turned(0.1) if plant is satellite else np.zeros(6)
+    with pytest.raises(ValueError, match="reference: "):
+        controller(x, None, reference)
+
+
+def test_references_of_most_of_a_turn_are_taken_on_from_their_middle(satellite):
+    """From half a turn on by 2.8 rad: 3π/2 either way holds them."""
+    given = [satellite.coordinates(turned(np.pi - 0.1 + 0.2 * k)) for k in range(15)]
+    rows = aligned(satellite, None, jnp.zeros(6), jnp.asarray(given))[1]
+    steps = np.linalg.norm(np.diff(rows[:, :3], axis=0), axis=1)
+    np.testing.assert_allclose(steps, 0.2, rtol=1e-4)
+    for row, k in zip(rows, range(15), strict=True):
+        assert angles(satellite.state(row)[None], np.pi - 0.1 + 0.2 * k)[0] < 1e-5
+
+
+def test_missing_and_repeated_readings_of_orientations(satellite):
+    C = np.eye(6)[[0, 1, 2, 0, 1, 2]]
+    observer = KalmanFilter(satellite, 1e-3, 1e-2, C=C, initial=0.05).prepared()
+    belief = observer.first(satellite.coordinates(turned(3.1)))
+    y = np.tile(satellite.coordinates(turned(-3.1))[:3], 2)
+    after = satellite.state(observer.corrected(belief, jnp.asarray(y)).mean)
+    assert angles(after[None], 3.1)[0] < 2 * np.pi - 6.2 + 1e-4
+    nothing = jnp.full(6, jnp.nan)
+    slope = jax.jacrev(lambda y: observer.corrected(belief, y).mean)(nothing)
+    np.testing.assert_array_equal(slope, 0)
+
+
 @pytest.mark.parametrize("rows", [[0, 1, 2], [2, 0, 1, 5]])
 def test_estimates_do_not_jump_at_half_a_turn(satellite, rows):
     """Measured and estimated vectors lie on two sides of half a turn at many of these steps."""

@@ -227,6 +227,7 @@ def test_deviations_are_the_same_problem():
         ({"seconds": 0.0}, "seconds: 0.0"),
         ({"seconds": np.nan}, "seconds: nan"),
         ({"seconds": np.inf}, "seconds: inf. Give a finite number"),
+        ({"seconds": True}, "seconds: True"),
         ({"seconds": "1"}, "seconds: '1' where real numbers"),
         ({"search_seconds": np.nan}, "search_seconds: nan"),
         ({"axes": 0}, "axes: 0 is not a list. Give state indices"),

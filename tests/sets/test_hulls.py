@@ -87,3 +87,6 @@ def test_boxes_and_polytopes_of_the_same_sums_are_the_same():
     for kind in (jm.Box, lambda *sides: jm.Box(*sides).to_polytope()):
         assert not kind([0, 0.3], [1, 0.3]).slice({1: 0.1 + 0.2}).is_empty()
         assert kind([0, 0.3], [1, 0.3]).slice({1: 0.3 + 1e-9}).is_empty()
+        # A far bound on the other side excuses nothing.
+        for ends, at in (([-1e9, 0.0], 1e-6), ([-1e12, 1e-3], 1.5e-3), ([0.0, 1e16], -20.0)):
+            assert kind([ends[0], 0], [ends[1], 1]).slice({0: at}).is_empty()

@@ -206,6 +206,9 @@ def test_checkpoints_that_do_not_fit(tmp_path):
         # The same at the start alone, as a penalty of what the start does not violate.
         other = lambda theta: (distance(theta) * (theta["b"].item() == START["b"]), {})
         descend(START, slope, other, optax.adam(0.3), Settings(3, checkpoint=path), DECIDES)
+    # Rounding beside the loss at the start is none of another function.
+    other = lambda theta: (distance(theta) + 1e-7 * distance(START), {})
+    descend(START, slope, other, optax.adam(0.3), Settings(3, checkpoint=path), DECIDES)
     whole = path.read_bytes()
     for damaged in (b"nothing", whole[: len(whole) // 2], b""):
         path.write_bytes(damaged)
