@@ -27,7 +27,7 @@ CASES = {
 
 def worth_rays(monkeypatch, count):
     """Cast rays for so many points of two coordinates, on any device."""
-    for name in ("MANY", "MANY_ELSEWHERE"):
+    for name in ("MANY_POINTS", "MANY_POINTS_ELSEWHERE"):
         monkeypatch.setattr(hull_labels, name, count)
 
 
