@@ -45,7 +45,8 @@ def aligned(plant: Any, limits: Any, xi: Array, reference: Any) -> tuple[Array, 
         return jnp.where(fixed, row, nearest_turns(joints, row, near))
 
     if reference.ndim == 1:
-        return nearest(xi, reference[:size]), reference
+        aim = nearest(reference[:size], reference[:size])  # not longer than 3π/2
+        return nearest(xi, aim), reference.at[:size].set(aim)
 
     def follow(near: Array, row: Array) -> tuple[Array, Array]:
         return (nearest(row, near),) * 2

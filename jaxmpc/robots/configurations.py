@@ -49,17 +49,17 @@ def rotations(joints: Sequence[int]) -> list[slice]:
 
 
 def nearest_turns(joints: Sequence[int], dq: Array, near: Array) -> Array:
-    """Return the motions dq (nv + …,) with their rotation vectors in place of which those of the
-    same orientation, v + 2πk v/|v|, are nearest to those of `near`, and at most 3π/2 long:
-    `retract` is singular at 2π."""
+    """Return the motions dq (nv + …,) with rotation vectors v + 2πk v/|v| of the same orientations:
+    those nearest to `near`, or, where these are longer than 3π/2, the shortest ones, for `retract`
+    is singular at 2π."""
     for motion in rotations(joints):
         v = dq[motion]
         square = jnp.sum(v**2)
         length = jnp.sqrt(jnp.where(square > 0, square, 1.0))
-        k = jnp.round((jnp.dot(v / length, near[motion]) - length) / (2 * np.pi))
-        ratio = 1 + 2 * np.pi * k / length
-        short = (square > 0) & (jnp.abs(ratio) * length <= 1.5 * np.pi)
-        dq = dq.at[motion].set(jnp.where(short, ratio, 1.0) * v)
+        along = jnp.stack([jnp.dot(v / length, near[motion]), jnp.zeros_like(length)])
+        longer = 2 * np.pi * jnp.round((along - length) / (2 * np.pi))
+        longer = jnp.where(jnp.abs(length + longer[0]) <= 1.5 * np.pi, longer[0], longer[1])
+        dq = dq.at[motion].set(jnp.where(square > 0, 1 + longer / length, 1.0) * v)
     return dq
 
 

@@ -51,11 +51,11 @@ def test_nearest_turns_are_the_same_orientation():
     nearest = jax.jit(lambda v, near: nearest_turns(joints, v, near))
     for _ in range(300):
         v, near = rng.normal(size=(2, 4)) * rng.choice([0.5, 1.5, 3.0], (2, 1))
-        v[:3] *= min(1, np.pi / np.linalg.norm(v[:3]))
         found, length = np.asarray(nearest(v, near)), np.linalg.norm(v[:3])
         same = v[:3] * (1 + 2 * np.pi * np.arange(-3, 4)[:, None] / length)
         best = same[np.argmin(np.linalg.norm(same - near[:3], axis=1))]
-        best = best if np.linalg.norm(best) <= 1.5 * np.pi else v[:3]
+        shortest = same[np.argmin(np.linalg.norm(same, axis=1))]
+        best = best if np.linalg.norm(best) <= 1.5 * np.pi else shortest
         np.testing.assert_allclose(found, [*best, v[3]], rtol=1e-5, atol=1e-5)
     zero = jnp.zeros(4)
     assert np.isfinite(jax.jacfwd(lambda v: nearest(v, zero + 2))(zero)).all()
@@ -155,6 +155,17 @@ def test_references_of_most_of_a_turn_are_taken_on_from_their_middle(satellite):
     np.testing.assert_allclose(steps, 0.2, rtol=1e-4)
     for row, k in zip(rows, range(15), strict=True):
         assert angles(satellite.state(row)[None], np.pi - 0.1 + 0.2 * k)[0] < 1e-5
+
+
+def test_references_of_many_turns_are_orientations_too(satellite):
+    xi = satellite.coordinates(turned(0.1))
+    for angle in (4 * np.pi + 0.3, -6 * np.pi - 2.0):
+        near, aim = aligned(satellite, None, xi, np.append(angle * AXIS, [0, 0, 0]))
+        assert np.linalg.norm(near - aim) < np.pi + 1e-4
+        assert angles(satellite.state(aim)[None], angle)[0] < 1e-5
+    rows = np.array([np.append((18.0 + 0.1 * k) * AXIS, [0, 0, 0]) for k in range(8)])
+    aims = aligned(satellite, None, xi, rows)[1]
+    np.testing.assert_allclose(np.linalg.norm(np.diff(aims[:, :3], axis=0), axis=1), 0.1, rtol=1e-3)
 
 
 def test_missing_and_repeated_readings_of_orientations(satellite):
