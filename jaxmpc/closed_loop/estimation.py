@@ -478,7 +478,8 @@ class KalmanFilter:
         for more in (of_states, known):
             after = after if more is None else after + more
         canonical = _canonical(model)
-        moved, after = after, jnp.concatenate([canonical(after), d])
+        moved, after = after, after if canonical is None else canonical(after)
+        after = jnp.concatenate([after, d])
         if P is None:
             return Belief(after, None)
         A, B = (jnp.asarray(v, d.dtype) for v in _slopes(model, xi, u))
@@ -486,7 +487,7 @@ class KalmanFilter:
         if self.estimates_numbers:
             of_numbers = jax.jacfwd(lambda d: model_step(self._informed(d, numbers), xi, u))(d)
             A = jnp.asarray(A).at[: len(xi), len(xi) :].add(of_numbers)
-        if canonical is not _as_it_is:
+        if canonical is not None:
             turned = matmul(jax.jacfwd(canonical)(moved), jnp.asarray(A)[: len(xi)])
             A = jnp.concatenate([turned, A[len(xi) :]])
         W = jnp.asarray(self._covariance("process"), d.dtype)
@@ -575,15 +576,12 @@ def _robot_model(model: Any) -> RobotModel | None:
     return model if isinstance(model, RobotModel) else None
 
 
-def _as_it_is(xi: Array) -> Array:
-    return xi
-
-
-def _canonical(model: Any) -> Callable[[Array], Array]:
-    """Return the function that makes rotation vectors ones of at most half a turn."""
+def _canonical(model: Any) -> Callable[[Array], Array] | None:
+    """Return the function that makes rotation vectors ones of at most half a turn, None where there
+    are none."""
     found = _robot_model(model)
     if found is None or not quaternions(found.robot.joints):
-        return _as_it_is
+        return None
     return lambda xi: found.robot.coordinates(found.robot.state(xi))
 
 

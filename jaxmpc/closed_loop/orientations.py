@@ -5,8 +5,8 @@ same orientation for every whole number k. Beyond half a turn from home v jumps 
 from there a plan to a target at +3 rad would turn the longer way, and where noise moves a robot
 across it every plan would begin anew. Plans therefore begin at the vector nearest to the target's,
 and those of references that change are taken on from row to row, as far as three quarters of a turn
-from home. Where limits are on a rotation
-vector, it stays as it is: the shorter way may lead through what they exclude.
+from home. Where limits are on a rotation vector, it stays as it is: the shorter way may lead
+through what they exclude.
 """
 
 from typing import Any
