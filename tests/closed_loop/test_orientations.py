@@ -168,6 +168,7 @@ def test_references_of_many_turns_are_orientations_too(satellite):
     np.testing.assert_allclose(np.linalg.norm(np.diff(aims[:, :3], axis=0), axis=1), 0.1, rtol=1e-3)
 
 
+@pytest.mark.long
 def test_missing_and_repeated_readings_of_orientations(satellite):
     C = np.eye(6)[[0, 1, 2, 0, 1, 2]]
     observer = KalmanFilter(satellite, 1e-3, 1e-2, C=C, initial=0.05).prepared()
@@ -180,6 +181,7 @@ def test_missing_and_repeated_readings_of_orientations(satellite):
     np.testing.assert_array_equal(slope, 0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rows", [[0, 1, 2], [2, 0, 1, 5]])
 def test_estimates_do_not_jump_at_half_a_turn(satellite, rows):
     """Measured and estimated vectors lie on two sides of half a turn at many of these steps."""
