@@ -364,13 +364,13 @@ class Loop:
         controller: Any = self.controller
         if hasattr(controller, "motion"):
             own_r, own_s = controller.motion(t)
-            r, s = own_r if r is None else first_row(r, x.dtype), own_s if s is None else s
+            r, s = own_r if r is None else r, own_s if s is None else s
+        r, s = (None if v is None else first_row(v, x.dtype) for v in (r, s))
         if hasattr(controller, "distance"):
             error = controller.distance(x, r, t)
         else:
-            r = None if r is None else first_row(r, x.dtype)
             error = error_of(model_of(controller), controller.mpc, controller.coordinates(x), r)
-        effort = u if s is None else u - first_row(s, u.dtype)
+        effort = u if s is None else u - s
         return jnp.sum(error * matmul(self.Q, error)) + jnp.sum(effort * matmul(self.R, effort))
 
     def violation(self, x: Array) -> Array:

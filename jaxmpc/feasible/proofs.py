@@ -161,10 +161,8 @@ def roll_out(p: ExactData, x: Array, inputs: Array, moved: Array) -> tuple[Array
         moving = (v != 0).astype(v.dtype)
         scaled = jnp.where((M == 0) | (jnp.abs(M) == 1), 0.0, 1.0) @ moving
         copied = (c == 0) & (scaled == 0) & ((M != 0).astype(v.dtype) @ moving <= 1)
-        growth, tiny = (
-            jnp.where(copied, 0.0, 2 * gamma(n + m + 2)),
-            jnp.where(copied, 0.0, UNDERFLOWS),
-        )
+        growth = jnp.where(copied, 0.0, 2 * gamma(n + m + 2))
+        tiny = jnp.where(copied, 0.0, UNDERFLOWS)
         bound = jnp.abs(A) @ jnp.abs(x) + jnp.abs(B) @ jnp.abs(u) + jnp.abs(c)
         error = jnp.abs(A) @ error + jnp.abs(B) @ u_error
         error = error * (1 + 1e-9) + growth * bound + tiny

@@ -181,14 +181,8 @@ class Batch:
         B = len(self.x)
         left = np.arange(B)
         # (On GPUs the solver's kernels take less time than the laws and the host's indices would.)
-        on_cpu = default_platform() == "cpu"
-        if (
-            transfer
-            and self.to_host
-            and on_cpu
-            and B >= MANY_STATES
-            and transferable(self.given[0])
-        ):
+        here = transfer and self.to_host and default_platform() == "cpu"
+        if here and B >= MANY_STATES and transferable(self.given[0]):
             left = self._transfer()
         self._run(_plans(self.devices), self.given, left)
         assert self.answer is not None

@@ -40,10 +40,10 @@ class Search:
         self.dynamics, self.slope = dynamics, slope
         self.least, self.most = values.min(axis=0), values.max(axis=0)
         self.slack = tolerance * (self.most - self.least)
-        # From the first to the last physics step of a period: where accelerations are taken.
+        # From the beginning of a period to that of its last physics step.
         robot = dynamics.robot
-        self.dt = robot.dt * (robot.substeps - 1) / robot.substeps
-        n, low, high = dynamics.robot.n, dynamics.lower - dynamics.z, dynamics.upper - dynamics.z
+        self.span = robot.dt * (robot.substeps - 1) / robot.substeps
+        n, low, high = robot.n, dynamics.lower - dynamics.z, dynamics.upper - dynamics.z
         A, B, _, _ = powers(dynamics.robot, slope)
         T = np.hstack([(A.lower + A.upper) / 2, (B.lower + B.upper) / 2])
         slack = 1e-9 * (np.abs(T) @ np.maximum(np.abs(low), np.abs(high)) + np.abs(dynamics.z[:n]))
@@ -145,13 +145,13 @@ class Search:
         return of, guess, split, swept[:, : D.nv], again & ~outgrown
 
     def _swept(self, lower: np.ndarray, upper: np.ndarray, push: Interval) -> Interval:
-        """Return where the robot is within a period that begins in a cell (cells, d), under
-        accelerations in push: v + [0, dt] a, then q + [0, dt] v."""
+        """Return where the robot can be when the physics steps of a period begin that begins in a
+        cell (cells, d), under accelerations in push: v + [0, span] a, then q + [0, span] v."""
         nv, swept = self.dynamics.nv, Interval(lower.copy(), upper.copy())
         push = push.mapped(np.nan_to_num)
         q, v = slice(0, nv), slice(nv, 2 * nv)
-        swept[:, v] = add(swept[:, v], _moved(push, self.dt))
-        swept[:, q] = add(swept[:, q], _moved(swept[:, v], self.dt))
+        swept[:, v] = add(swept[:, v], _moved(push, self.span))
+        swept[:, q] = add(swept[:, q], _moved(swept[:, v], self.span))
         return swept
 
     def _polynomials(
@@ -185,16 +185,16 @@ class Search:
     ) -> np.ndarray:
         """Return how much each coordinate's width (cells, d) adds to the bounds of δ_k, in parts of
         what δ_k has: by second derivatives, and by how far the robot goes within a period."""
-        nv, d, dt = self.dynamics.nv, self.dynamics.d, self.dt
+        nv, d, span = self.dynamics.nv, self.dynamics.d, self.span
         i, j = np.triu_indices(d)
         size = np.maximum(np.abs(bend.lower), np.abs(bend.upper)).T * half[:, i] * half[:, j]
         score = np.zeros_like(half)
         for a in range(d):
             score[:, a] = size[:, (i == a) | (j == a)].sum(axis=1)
         slope = np.maximum(np.abs(rest.lower), np.abs(rest.upper))
-        score[:, nv : 2 * nv] += dt * slope[:, :nv] * half[:, nv : 2 * nv]
+        score[:, nv : 2 * nv] += span * slope[:, :nv] * half[:, nv : 2 * nv]
         rate = np.maximum(np.abs(along.lower), np.abs(along.upper)) * half
-        score += dt * slope[:, nv + k : nv + k + 1] * rate
+        score += span * slope[:, nv + k : nv + k + 1] * rate
         return score / max(self.most[k] - self.least[k], 1e-12)
 
     def _require_inside(self, positions: Interval) -> None:
@@ -215,10 +215,10 @@ class Search:
                 )
 
 
-def _moved(rate: Interval, dt: float) -> Interval:
-    """Return [0, dt] · rate, dt as the sum of its steps, whatever their rounding."""
+def _moved(rate: Interval, span: float) -> Interval:
+    """Return [0, span] · rate, span as the sum of its steps, whatever their rounding."""
     zero = np.zeros_like(rate.lower)
-    return multiply(Interval(zero, zero + dt * (1 + 1e-12)), rate)
+    return multiply(Interval(zero, zero + span * (1 + 1e-12)), rate)
 
 
 def _stacked(columns: list[Interval]) -> Interval:

@@ -71,7 +71,7 @@ def render(
     motions, inputs, ghosts = _checked(robot, states, inputs, target, every)
     for name, value in (("width", width), ("height", height)):
         whole(name, value, 1)
-    count, samples = motions.shape[:2]
+    count = len(motions)
     if numbers is not None and len(numbers) != count:
         fail("numbers", f"{len(numbers)} of {count} robots", "Give one for each")
     model = _drawn(robot.mujoco if robot.shapes is None else robot.shapes, width, height)

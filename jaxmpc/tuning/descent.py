@@ -229,12 +229,10 @@ def descend(
     if path is not None and path.exists():
         state = _load_checkpoint(path, theta, optimizer, mark)
         # Another loss or plant may have the same value at the start.
-        kept = [t for t, check in enumerate(state.checks) if check]
-        losses = np.array([state.checks[t]["loss"] for t in kept], float)
-        best = kept[int(np.argmin(np.nan_to_num(losses, nan=np.inf)))]
-        for t in dict.fromkeys((0, best, kept[-1])):
+        last = max(t for t, check in enumerate(state.checks) if check)
+        rounding = 1e-6 * abs(state.checks[0]["loss"])  # of sums that may be near 0 by now
+        for t in dict.fromkeys((0, _best(state.checks), last)):
             before, now = state.checks[t]["loss"], _checked(validate, state.thetas[t])["loss"]
-            rounding = 1e-6 * abs(losses[0])  # of sums that may be near 0 by now
             if not np.isclose(now, before, rtol=1e-4, atol=rounding, equal_nan=True):
                 problem = f"had the validation loss {before:.9g} after {t} steps, now {now:.9g}"
                 cure = "Give it the same data, loss, plant and solver, or remove it"
@@ -272,9 +270,15 @@ def descend(
     return _record(state)
 
 
+def _best(checks: list[dict[str, float]]) -> int:
+    """Return the number of the step with the least validation loss, of those that have one."""
+    loss = lambda t: np.nan_to_num(checks[t]["loss"], nan=np.inf)
+    return min((t for t, check in enumerate(checks) if check), key=loss)
+
+
 def _progress(state: State, shown: str | None) -> str:
     """Return the loss of the last step, and of the best validation the loss and what is shown."""
-    best = min((c for c in state.checks if c), key=lambda c: np.nan_to_num(c["loss"], nan=np.inf))
+    best = state.checks[_best(state.checks)]
     more = "" if shown is None else f", {shown} {best[shown]:.4g}"
     return f"loss {state.rows[-1]['loss']:.4g}, best on validation {best['loss']:.4g}{more}"
 

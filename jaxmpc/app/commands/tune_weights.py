@@ -230,7 +230,7 @@ def problem_of_file(command: TuneWeights) -> WeightProblem:
     if command.settling is None:
         command = dataclasses.replace(command, settling=SETTLING)
     overrides = given_options(command, "horizon", "terminal")
-    config = with_margin(configs.load(command.config, overrides, "tune"), command)
+    config = tightened_config(configs.load(command.config, overrides, "tune"), command)
     hard, rho = config.build_mpc(), config.cost.rho
     if rho is not None:  # the number that "exact" stands for
         soft = config.build_controlled().soft
@@ -381,7 +381,7 @@ def require_sizes(command: TuneWeights, steps: int, n: int, m: int) -> None:
             fail(f"--{name}", f"{min(given):g}", "Give weights of at least 0")
 
 
-def with_margin(config: configs.Config, command: TuneWeights) -> configs.Config:
+def tightened_config(config: configs.Config, command: TuneWeights) -> configs.Config:
     """Return the problem with --margin, or with one to start from where tightening is tuned."""
     margin, tuned = config.limits.margin, "tightening" in command.tune
     if command.margin is not None or (tuned and not margin):
