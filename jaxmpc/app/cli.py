@@ -133,8 +133,8 @@ def command_first(argv: Sequence[str]) -> list[str]:
 
 
 def as_json(options: Any, outcome: Outcome, said: str, begun: float) -> dict[str, Any]:
-    """Return what a command came to: its exit code, the lines that it printed, and its results, or
-    those that it wrote as JSON into its folder since `begun`."""
+    """Return what a command came to: its exit code, its error, the lines that it printed, and its
+    results, or those that it wrote as JSON into its folder since `begun`."""
     folder: Any = getattr(options, "output", None)
     summary = outcome.summary
     for name in RECORDS if folder is not None and summary is None else ():
@@ -143,6 +143,7 @@ def as_json(options: Any, outcome: Outcome, said: str, begun: float) -> dict[str
             summary = json.loads(path.read_text(encoding="utf-8"))
     return {
         "exit_code": outcome.code,
+        "error": outcome.error,
         "output": None if folder is None else str(folder),
         "lines": said.splitlines(),
         "summary": summary,
@@ -167,7 +168,8 @@ def run(options: Any, argv: Sequence[str]) -> Outcome:
             cure = "Make room where it is written to" + resuming
             cure = cure if full else "Give files and folders that are there and can be written"
             message = f"{error.filename or 'writing'}: {error.strerror}. {cure}"
-        return Outcome(report_error(named_options(message, options)))
+        message = named_options(message, options)
+        return Outcome(report_error(message), error=message)
     except KeyboardInterrupt:
         if not options.keeps:
             print("\nstopped; nothing is kept")
@@ -277,6 +279,10 @@ def parse_options(kind: Any, prog: str, words: Sequence[str]) -> tuple[Everywher
     """
     both = with_common(kind)
     known = {f"--{field.name.replace('_', '-')}": field.name for field in fields(both)}
+    for before, word in zip((prog, *words), words, strict=False):
+        option, equals, value = word.partition("=")
+        if not word or (option in known and equals and not value):
+            fail(option or before, "is empty", "Give a value, or leave it out")
     text = io.StringIO()
     try:
         with contextlib.redirect_stderr(text):

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxmpc.checks import fail, number, require_kind
+from jaxmpc.checks import fail, positive, require_kind
 from jaxmpc.files import open_folder, require_new, versions
 from jaxmpc.mpc.plan import rate_ends
 from jaxmpc.mpc.problem import MPC, at_stage
@@ -65,7 +65,7 @@ class CFiles:
         if dtype not in REAL:
             fail("dtype", f"{dtype!r}", 'Give "float64" or "float32"')
         tolerance = usual[dtype] if tolerance is None else tolerance
-        number("tolerance", tolerance, 0, "Give a positive number")
+        positive("tolerance", tolerance)
         kinds = (".h", ".c", "_sizes.h", "_tables.h", "_example.c")
         paths = prepared_paths(Path(folder), [f"{name}{kind}" for kind in kinds], overwrite)
         return cls(name, tuple(paths), REAL[dtype], tolerance)

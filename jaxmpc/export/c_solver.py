@@ -17,7 +17,7 @@ from jaxmpc.arrays import Reals, host_array
 from jaxmpc.batches import each_part, joined
 from jaxmpc.checks import (
     fail,
-    number,
+    positive,
     require_finite,
     require_kind,
     require_shape,
@@ -318,7 +318,7 @@ def check_fixed_steps(
     require_kind("solver", solver, ADMM)
     mpc.require_constant("closed loops need one system for all time steps", "system")
     whole("plans", plans, 1)
-    number("tolerance", tolerance, 0, "Give a positive number")
+    positive("tolerance", tolerance)
     require_box(mpc, lower, upper)
     with jax.enable_x64(True):
         lower, upper = host_array("lower", lower), host_array("upper", upper)

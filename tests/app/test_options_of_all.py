@@ -46,7 +46,8 @@ def test_json_is_one_object(tmp_path, capsys):
     assert found["summary"] is None
     assert cli.main(["init", "--json", "--output", str(path)]) == 2
     out, err = capsys.readouterr()
-    assert json.loads(out)["exit_code"] == 2 and "exists" in err
+    found = json.loads(out)
+    assert found["exit_code"] == 2 and "exists" in found["error"] and found["error"] in err
 
 
 def test_json_has_the_summary(tmp_path, capsys, monkeypatch):

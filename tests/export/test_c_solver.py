@@ -289,6 +289,7 @@ def test_bad_arguments(tmp_path):
         (dict(name="1st"), "name: '1st'"),
         (dict(dtype="float16"), "dtype: 'float16'"),
         (dict(tolerance=-1.0), "tolerance: "),
+        (dict(tolerance=0), "tolerance: "),
         (dict(solver="fast"), "solver: "),
     ):
         with pytest.raises(ValueError, match=message):
