@@ -135,12 +135,17 @@ def export_explicit_c(
         cure = "Give critical_regions a bounded set within that has volume"
         fail("regions", f"are those of a feasible set that is {what}", cure)
     vertices = [region.vertices for region in regions.regions]
-    facets = Facets.of(regions, np.ptp(np.concatenate(vertices), axis=0))
+    corners = np.concatenate(vertices)
+    facets = Facets.of(regions, np.ptp(corners, axis=0))
     tree = SearchTree.of(facets, vertices, 1e-9)
     mpc = regions.mpc
+    # Differences from here are as exact as x is, wherever X_N lies, where sums about 0 are not.
+    centre = (corners.min(axis=0) + corners.max(axis=0)) / 2
+    centre = centre.astype(dtype).astype(np.float64)
     tables = {
+        "centre": centre,
         "plane_normal": facets.normal.ravel(),
-        "plane_offset": facets.offset,
+        "plane_offset": facets.offset - facets.normal @ centre,
         "node_plane": tree.plane,
         "node_inside": tree.inside,
         "node_outside": tree.outside,
@@ -149,7 +154,7 @@ def export_explicit_c(
         "facet_plane": facets.plane,
         "facet_side": facets.side,
         "law_gain": np.array([region.K.T.ravel() for region in regions.regions]).T,
-        "law_offset": np.array([region.k for region in regions.regions]).T,
+        "law_offset": np.array([region.k + region.K @ centre for region in regions.regions]).T,
         **input_limits(mpc),
     }
     number = lambda value: literal(value, files.real).replace("(real)", "")

@@ -14,10 +14,10 @@ typedef NAME_real real;
 
 enum { P = NAME_PARAMETERS, M = NAME_INPUTS };
 
-/* a'x - b of half-space i. */
-static real beyond(int i, const real *x) {
+/* How far half-space i is exceeded. z = x - centre, as offsets are those about the centre. */
+static real beyond(int i, const real *z) {
   real sum = -plane_offset[i];
-  for (int k = 0; k < P; k++) sum += plane_normal[i * P + k] * x[k];
+  for (int k = 0; k < P; k++) sum += plane_normal[i * P + k] * z[k];
   return sum;
 }
 
@@ -38,8 +38,10 @@ static void clip(const real *x, real *u) {
 }
 
 int NAME_evaluate(const real x[NAME_PARAMETERS], real u[NAME_INPUTS]) {
+  real z[P];
   for (int i = 0; i < M; i++) u[i] = NAN;
   for (int k = 0; k < P; k++) {
+    z[k] = x[k] - centre[k];
     if (!isfinite(x[k])) {
       clip(x, u);
       return NAME_NON_FINITE;
@@ -52,7 +54,7 @@ int NAME_evaluate(const real x[NAME_PARAMETERS], real u[NAME_INPUTS]) {
   while (count > 0 && !(least <= 0)) {
     int node = waiting[--count];
     if (node_plane[node] >= 0) {
-      real over = beyond(node_plane[node], x);
+      real over = beyond(node_plane[node], z);
       if (!(over <= (real)-NAME_NEAR)) waiting[count++] = node_outside[node];
       if (!(over >= (real)NAME_NEAR)) waiting[count++] = node_inside[node];
       continue;
@@ -62,7 +64,7 @@ int NAME_evaluate(const real x[NAME_PARAMETERS], real u[NAME_INPUTS]) {
       int region = leaf_region[node_inside[node] + j];
       real worst = (real)-INFINITY;
       for (int f = facet_begin[region]; f < facet_begin[region + 1]; f++) {
-        real over = (real)facet_side[f] * beyond(facet_plane[f], x);
+        real over = (real)facet_side[f] * beyond(facet_plane[f], z);
         if (!(over <= worst)) worst = isfinite(over) ? over : (real)INFINITY;
       }
       if (worst < least) least = worst, best = region;
@@ -70,7 +72,7 @@ int NAME_evaluate(const real x[NAME_PARAMETERS], real u[NAME_INPUTS]) {
   }
   for (int i = 0; i < M; i++) {
     u[i] = law_offset[best * M + i];
-    for (int k = 0; k < P; k++) u[i] += law_gain[(best * P + k) * M + i] * x[k];
+    for (int k = 0; k < P; k++) u[i] += law_gain[(best * P + k) * M + i] * z[k];
   }
   int finite = 1;
   for (int i = 0; i < M; i++) finite = finite && isfinite(u[i]);

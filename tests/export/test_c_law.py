@@ -116,6 +116,31 @@ def test_a_law_in_other_units(regions, tmp_path):
 
 
 @compiled
+@pytest.mark.parametrize("dtype, error", [("float64", 1e-9), ("float32", 2e-4)])
+def test_a_law_far_from_the_origin(tmp_path, dtype, error):
+    """Kelvin, world coordinates: sums about 0 in float32 are wrong by 1e-4, here by 1e-7 of X_N."""
+    home, A = np.array([300.0, -80.0]), np.array([[1.0, 0.1], [0.0, 1.0]])
+    system = jm.LinearSystem(A, [[0.005], [0.1]], c=home - A @ home)
+    limits = jm.Box(home - [1.0, 2.0], home + [1.0, 2.0])
+    mpc = jm.MPC(system, np.eye(2), [[0.1]], 4, limits, jm.Box([-5.0], [5.0]))
+    regions = jm.explicit.critical_regions(mpc, reference=home)
+    law = built(regions, tmp_path, dtype)
+    points = np.concatenate([r.vertices for r in regions.regions])
+    lower, upper = points.min(axis=0), points.max(axis=0)
+    x = np.random.default_rng(0).uniform(lower, upper, (300, 2)).astype(dtype)
+    wanted = regions.law(x.astype(float))
+    facets, offsets, _ = regions.facets
+    unit = np.linalg.norm(facets, axis=1)
+    near = np.min(np.abs(facets @ x.T - offsets[:, None]) / unit[:, None], axis=0)
+    for state, u, far in zip(x, wanted, near > 1e-4, strict=True):
+        found, status = law(state)
+        if far:  # elsewhere rounding may choose the other region
+            assert status == (2 if np.isnan(u[0]) else 1)
+        if status == 1 and not np.isnan(u[0]):
+            np.testing.assert_allclose(found, u, rtol=0, atol=error)
+
+
+@compiled
 @pytest.mark.slow
 def test_closed_loop_is_the_solvers(tmp_path):
     """With previous inputs in the state: as many numbers as the problem has parameters."""
