@@ -30,7 +30,7 @@ class Outcome:
     (B, T+1, n), input_excess (B, T, m): by how much each limit is violated, in its unit; 0 inside,
     NaN where the run is not finite. band (n,): largest distance that counts as at the target.
     The other fields have one entry for each loop, (B,):
-      kept          all limits of states and inputs hold at all times (to `violations.TOLERANCE`)
+      kept          all limits of states and inputs hold at all times (to `sets.limits.TOLERANCE`)
       reached       the last state is within the band of the target, in every coordinate
       settling      time in s from which on every coordinate stays within the band; inf: never
       cost          sum of the stage costs

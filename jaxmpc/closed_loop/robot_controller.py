@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.arrays import Reals, as_array, as_weight
-from jaxmpc.checks import concrete, fail, number, whole
+from jaxmpc.checks import concrete, fail, number, require_kind, whole
 from jaxmpc.closed_loop.feedback import one_state
 from jaxmpc.closed_loop.nonlinear_controller import (
     at_rest,
@@ -324,8 +324,7 @@ class RobotController:
         sqp_steps: int = 1,
         hessian: Literal["exact", "gauss-newton"] = "gauss-newton",
     ) -> None:
-        if not isinstance(tasks, tuple | list):
-            fail("tasks", f"is a {type(tasks).__name__}", "Give a tuple of jm.mpc.Task: (task,)")
+        require_kind("tasks", tasks, tuple, list, cure="Give a tuple of jm.mpc.Task: (task,)")
         solver = DEFAULT if solver is None else solver
         if solver.iterations is None and linearize != "set-point":
             solver = replace(solver, iterations=0)
@@ -487,8 +486,7 @@ def _prepared(given: RobotController, solver: ADMM) -> dict[str, Any]:
     robot, mpc, linearize = given.robot, given.mpc, given.linearize
     if linearize not in LINEARIZATIONS:
         fail("linearize", f"{linearize!r}", f"Give one of {', '.join(LINEARIZATIONS)}")
-    if not isinstance(robot, Robot | LinearPlant):
-        fail("robot", f"is a {type(robot).__name__}", "Give a Robot or a LinearPlant")
+    require_kind("robot", robot, Robot, LinearPlant, cure="Give a Robot or a LinearPlant")
     mpc.validate()
     sizes = (mpc.system.n, mpc.system.m)
     if sizes != (robot.n, robot.m):

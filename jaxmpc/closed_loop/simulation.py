@@ -225,16 +225,14 @@ def checked_loop(
     if own is not None and observer is not None:
         fail("observer", "given beside that of the controller", "Leave it out")
     if observer is not None:
-        if not isinstance(observer, KalmanFilter):
-            fail("observer", f"is a {type(observer).__name__}", "Give a closed_loop.KalmanFilter")
+        require_kind("observer", observer, KalmanFilter, cure="Give a closed_loop.KalmanFilter")
         observer = arrays(observer.prepared())
         if observer.model.n != n:
             what = f"has {observer.model.n} states, the controller's model {n}"
             fail("observer.model", what, "Give the model of the same plant")
     outputs = next((one.p for one in (observer, own) if one is not None), n)
     if noise is not None:
-        if not isinstance(noise, Noise):
-            fail("noise", f"is a {type(noise).__name__}", "Give a closed_loop.Noise")
+        require_kind("noise", noise, Noise, cure="Give a closed_loop.Noise")
         noise = noise.prepared(n, outputs)
     measured = given.output_disturbance
     if measured is not None:

@@ -15,10 +15,10 @@ import numpy as np
 import scipy
 
 from jaxmpc.checks import fail
-from jaxmpc.mpc.condense import Inequalities, row_lengths
+from jaxmpc.mpc.condense import Inequalities
 from jaxmpc.pytrees import record
 from jaxmpc.sets.convex_sets import Polytope
-from jaxmpc.sets.geometry import Empty, Flat, affine_hull, framed
+from jaxmpc.sets.geometry import Empty, Flat, affine_hull, framed, row_lengths
 from jaxmpc.sets.lp import FLAT, Program, bound, extent, maximise, power_of_two
 
 # Reasons why a set has no facets: it has no volume.

@@ -9,9 +9,8 @@ eliminated each row is F θ + G v + (D + G M) ω, and it holds for all disturban
 convex in (θ, v, M) together. With T ≥ |D + G M|, entry by entry, these are linear rows over
 (θ, v, M, T): a `PlanPolytope`, whose projection on θ is the feasible set of the class.
 
-*Tubes* (Mayne, Seron & Raković 2005, Automatica 41): u_k = v_k + K (x_k − z_k) with a nominal
-trajectory z that begins anywhere in x_0 − S, S = center + {G ζ : |ζ_i| ≤ 1} a robust invariant set
-under K. The rows of z are tightened by S, at all steps alike, and z_0 = θ − center − G ζ: linear
+*Tubes*, as in `mpc/policy_rows.py`: the rows of the nominal trajectory z are tightened by the
+section S = center + {G ζ : |ζ_i| ≤ 1}, at all steps alike, and z_0 = θ − center − G ζ: linear
 rows over (θ, v, ζ), which are one more case of the above, with ζ beside v and no M.
 
 *Proofs* are evaluated on the rows in rational arithmetic (`ExactRows`), whatever found the numbers.

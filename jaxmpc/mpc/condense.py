@@ -49,6 +49,7 @@ from jaxmpc.qp.linalg import (
     solve,
 )
 from jaxmpc.qp.problem import QP, Bounds
+from jaxmpc.sets.geometry import row_lengths
 from jaxmpc.systems.riccati import lqr, spectral_radius
 from jaxmpc.systems.system import LinearSystem, host_matrices
 from jaxmpc.systems.units import natural_units
@@ -411,9 +412,3 @@ class Inequalities(NamedTuple):
         length = row_lengths(np.hstack([self.C, self.D]))
         C, D = self.C / length[:, None], self.D / length[:, None]
         return self._replace(C=C, D=D, b=self.b / length), length
-
-
-def row_lengths(M: np.ndarray) -> np.ndarray:
-    """Return the norm of each row of M, and 1 for a row of zeros."""
-    length = np.linalg.norm(M, axis=1)
-    return np.where(length > 0, length, 1.0)

@@ -276,20 +276,26 @@ def unshared(parts: tuple) -> tuple:
 
 def harmless(mpc: MPC) -> tuple[MPC, Any]:
     """Return the problem with harmless dynamics and weights where they are not finite, and whether
-    they are: numbers that are being traced cannot be refused."""
+    they are: numbers that are being traced cannot be refused. Others stay as they are, for with
+    known dynamics there are gains and sets that traced ones have not."""
     fields = ("system", "Q", "R", "terminal_cost", "stage_weights", "input_rate_weight")
     data = {name: getattr(mpc, name) for name in fields}
-    if concrete(data):
+    instead = {**jax.tree.map(lambda _: 0.0, data), "R": np.eye(mpc.system.m)}
+    leaves, tree = jax.tree.flatten(data)
+    traced = [i for i, leaf in enumerate(leaves) if not concrete(leaf)]
+    if not traced:
         return mpc, True
-    clean, finite = _harmless(data, np.eye(mpc.system.m))
-    return replace(mpc, **clean), finite
+    values = [(leaves[i], jax.tree.leaves(instead)[i]) for i in traced]
+    clean, finite = _harmless(values)
+    for i, leaf in zip(traced, clean, strict=True):
+        leaves[i] = leaf
+    return replace(mpc, **jax.tree.unflatten(tree, leaves)), finite
 
 
 @own_modes
-def _harmless(data: dict[str, Any], R: np.ndarray) -> tuple[dict[str, Any], Array]:
-    finite = all_finite(data)
-    clean = jax.tree.map(lambda v: jnp.where(finite, jnp.asarray(v), 0), data)
-    return {**clean, "R": jnp.where(finite, jnp.asarray(data["R"]), R)}, finite
+def _harmless(values: list[tuple[Array, Any]]) -> tuple[list[Array], Array]:
+    finite = all_finite([value for value, _ in values])
+    return [jnp.where(finite, value, instead) for value, instead in values], finite
 
 
 def zeros_of(controller: Callable[[Array], Control[Planned]], x: Array) -> Control[Planned]:

@@ -80,6 +80,11 @@ class TwoSided:
     lower: Any
     upper: Any
 
+    def __post_init__(self) -> None:
+        store_floats(self, *(name for name in vars(self) if name in AXES))
+        self._fill()
+        store_stages(self, "stages")
+
     def _fill(self) -> None:
         """Make one row of vectors C and D, and of numbers the sides of every row."""
         if dimensions(self.C) == 1:
@@ -125,11 +130,6 @@ class Outputs(TwoSided):
     names: tuple[str, ...] = static(default=())
     units: tuple[str, ...] = static(default=())
 
-    def __post_init__(self) -> None:
-        store_floats(self, "C", "lower", "upper", "D")
-        self._fill()
-        store_stages(self, "stages")
-
 
 @pytree
 class Soft(TwoSided):
@@ -158,11 +158,6 @@ class Soft(TwoSided):
     stages: tuple[int, ...] | None = static(default=None)
     names: tuple[str, ...] = static(default=())
     units: tuple[str, ...] = static(default=())
-
-    def __post_init__(self) -> None:
-        store_floats(self, "C", "lower", "upper", "rho", "quadratic", "D")
-        self._fill()
-        store_stages(self, "stages")
 
 
 @named_pytree

@@ -11,7 +11,7 @@ import scipy
 from jax import Array
 
 from jaxmpc.arrays import Reals, host_array
-from jaxmpc.checks import fail, require_finite, require_shape
+from jaxmpc.checks import fail, require_finite, require_kind, require_shape
 from jaxmpc.mpc.problem import HARD, MPC, weights_of
 from jaxmpc.mpc.rows import Block, blocks, joined_bounds
 from jaxmpc.pytrees import named_pytree, pytree, static
@@ -58,8 +58,7 @@ def equilibrium(
     message says how far the closest one stays from it. NumPy in float64; not traceable; the
     residual of each row is below 1e-9 times the size of its terms, in any units.
     """
-    if not isinstance(system, LinearSystem):
-        fail("system", f"is a {type(system).__name__}", "Give a jm.LinearSystem")
+    require_kind("system", system, LinearSystem)
     system.validate()
     n, m = system.n, system.m
     C = np.eye(n) if C is None else host_array("C", C)
@@ -78,8 +77,7 @@ def equilibrium(
         (inputs, slice(n, n + m), "inputs", m),
     ):
         if set_ is not None:
-            if not isinstance(set_, Box):
-                fail(name, f"is a {type(set_).__name__}", "Give a Box, or None")
+            require_kind(name, set_, Box, cure="Give a Box, or None")
             set_.validate(name, size)
             low[part], high[part] = np.asarray(set_.lower, float), np.asarray(set_.upper, float)
     # In units in which all numbers are about 1: none of the user's decide what is an equilibrium.

@@ -189,9 +189,12 @@ def require_room(mpc: MPC, found: Sequence[Any]) -> None:
         if len(short):
             k, i = short[0]
             unit = f" {b.units[i]}" if b.units[i] else ""
+            row = b.names[i] if b.names[i].startswith(b.kind) else f"{b.kind} {b.names[i]}"
             what = (
-                f"takes more than there is of {b.kind} {b.names[i]}: at k = {b.steps[k]} the "
+                f"takes more than there is of {row}: at k = {b.steps[k]} the "
                 f"limits cross by {-room[k, i]:.3g}{unit}"
             )
             cure = "Shrink it, shorten the horizon, or give a gain that rejects it better"
+            if b.linear is not None:
+                cure += "; or make it two soft rows, one with each side"
             fail("disturbance", what, cure)

@@ -20,7 +20,7 @@ that is not positive definite gives NaN.
 """
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from importlib.metadata import version
 from typing import Any, TypeVar
@@ -81,7 +81,9 @@ def apply_transposed(M: Array, v: Array) -> Array:
     return matmul(v, M) if M.ndim == 2 else matmul(v[..., None, :], M)[..., 0, :]
 
 
-def by_step(*data: tuple[Array, int]) -> tuple[tuple[Any, ...], Callable[[tuple], tuple]]:
+def by_step(
+    *data: tuple[Array, int],
+) -> tuple[tuple[Any, ...], Callable[[Sequence[Any]], tuple[Any, ...]]]:
     """Return what a scan over the steps reads of arrays, None of one that is the same at all steps,
     and the function that returns all of them at the step of which it is given that part.
 
@@ -89,7 +91,7 @@ def by_step(*data: tuple[Array, int]) -> tuple[tuple[Any, ...], Callable[[tuple]
     """
     each = tuple(v if v.ndim > axes else None for v, axes in data)
 
-    def at(part: tuple) -> tuple:
+    def at(part: Sequence[Any]) -> tuple[Any, ...]:
         return tuple(v if own is None else own for (v, _), own in zip(data, part, strict=True))
 
     return each, at

@@ -124,8 +124,7 @@ class RobotSetting:
         claim: str = "limits",
     ) -> "RobotSetting":
         """Check the arguments of `map_robot`. Raises ValueError; compiles no loop."""
-        if not isinstance(robot, Robot | LinearPlant):
-            fail("robot", f"is a {type(robot).__name__}", "Give a Robot or a LinearPlant")
+        require_kind("robot", robot, Robot, LinearPlant, cure="Give a Robot or a LinearPlant")
         if claim not in CLAIMS:
             fail("claim", f"{claim!r}", f"Give one of {', '.join(CLAIMS)}")
         require_kind("mpc", mpc, MPC, cure="Give a jm.MPC, such as of robot_mpc")

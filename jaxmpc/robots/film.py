@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from jaxmpc.arrays import Reals, host_array
-from jaxmpc.checks import fail, positive, require_finite, require_shape, whole
+from jaxmpc.checks import fail, positive, require_finite, require_kind, require_shape, whole
 from jaxmpc.pytrees import record
 from jaxmpc.robots.description import host_coordinates
 from jaxmpc.robots.mujoco_access import mujoco, number_of
@@ -119,8 +119,7 @@ def _checked(
 ) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
     """Return states (B, T+1, nq + nv), inputs (B, T, m) and the target's qpos at each frame
     (F, nq), None where there are none; raise ValueError for wrong arguments of `render`."""
-    if not isinstance(robot, Robot):
-        fail("robot", f"is a {type(robot).__name__}", "Only a Robot has a shape to draw")
+    require_kind("robot", robot, Robot, cure="Only a Robot has a shape to draw")
     states = host_array("states", states)
     if states.ndim not in (2, 3) or states.shape[-1] != robot.state_size or not states.size:
         fail("states", f"shape {states.shape}", f"Give ([robots,] samples, {robot.state_size})")
@@ -353,9 +352,8 @@ def save_video(path: str | Path, frames: Any, fps: float) -> None:
     and joins frames that are equal.
     Raises ValueError for other endings and frames, and where .mp4 cannot be written.
     """
-    if not isinstance(path, str | Path):
-        cure = 'Give the path first: save_video("film.gif", frames, fps)'
-        fail("path", f"is a {type(path).__name__}", cure)
+    cure = 'Give the path first: save_video("film.gif", frames, fps)'
+    require_kind("path", path, str, Path, cure=cure)
     path, frames = Path(path), np.asarray(frames)
     check_frames(frames, fps)
     kind = path.suffix.lower()

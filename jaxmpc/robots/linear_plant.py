@@ -7,7 +7,7 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.arrays import dimensions
-from jaxmpc.checks import fail, require_shape
+from jaxmpc.checks import fail, require_kind, require_shape
 from jaxmpc.mpc.steady_state import equilibrium
 from jaxmpc.pytrees import pytree, static
 from jaxmpc.sets.convex_sets import Box
@@ -39,8 +39,7 @@ class LinearPlant:
 
     def validate(self) -> None:
         """Raise ValueError for a bad system, or limits of other sizes."""
-        if not isinstance(self.system, LinearSystem):
-            fail("system", f"is a {type(self.system).__name__}", "Give a jm.LinearSystem")
+        require_kind("system", self.system, LinearSystem)
         self.system.validate()
         if self.system.dt is None:
             fail("system.dt", "is None", "Give the sampling period, in seconds or in time_unit")

@@ -64,13 +64,9 @@ def maximal_control_invariant_set(
     `inputs` with A x + B u + c + E w in C for all w in `disturbance`.
 
     Arguments:
-        system: n states, m inputs; A may be singular, c may be anything. A sequence of systems: the
-            vertices of a hull, in which (A, B, c) may be anywhere at each step, unknown to the
-            input.
+        system, inputs, disturbance, disturbance_matrix: as in `predecessor`; of several systems the
+            one of each step is unknown to the input.
         states: bounded set in R^n with volume.
-        inputs: set in R^m, or None for all of R^m.
-        disturbance: bounded set in R^p that holds the origin, or None for w = 0.
-        disturbance_matrix: E (n, p), None for the identity.
         max_iterations: largest k of the recursion C_0 = states, C_{k+1} = Pre(C_k) & C_k.
         tolerance: gap below which an inner and an outer set count as one.
 

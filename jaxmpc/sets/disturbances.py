@@ -11,8 +11,8 @@ import jax
 import numpy as np
 from jax import Array
 
-from jaxmpc.arrays import Reals, as_array, as_column, host_array, store_floats
-from jaxmpc.checks import concrete, fail, require_finite, require_shape
+from jaxmpc.arrays import Reals, as_array, as_column, dimensions, host_array, store_floats
+from jaxmpc.checks import concrete, fail, require_finite, require_kind, require_shape
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.linalg import matmul, namespace
 from jaxmpc.sets.convex_sets import (
@@ -110,9 +110,16 @@ def is_centred(W: Box | Zonotope) -> bool:
 def require_disturbance(argument: str, W: Any, dimension: int) -> None:
     """Raise ValueError, naming `argument`, unless W is a bounded set in R^dimension that holds the
     origin. Of a set that is traced by JAX the kind and the shapes are checked."""
-    if not isinstance(W, Box | Polytope | Zonotope | Vertices | Image):
-        what = f"is a {type(W).__name__}"
-        fail(argument, what, "Give a Box, a Polytope or a Zonotope of w, or None")
+    cure = "Give a Box, a Polytope or a Zonotope of w, or None"
+    require_kind(argument, W, Box, Polytope, Zonotope, Vertices, Image, cure=cure)
+    if concrete(W) and any(np.isnan(values).any() for values in jax.tree.leaves(W)):
+        fail(argument, "holds NaN", "Give a bounded set")
+    if W.dimension not in (
+        dimension,
+        1 if isinstance(W, Box) and not dimensions(W.lower) else None,
+    ):
+        what = f"has dimension {W.dimension} where {dimension} is needed"
+        fail(argument, what, "Give one w for each state, or x+ = ... + E w as disturbance_matrix=E")
     W.validate(argument, dimension)
     if not concrete(W):
         if isinstance(W, Polytope):
@@ -133,7 +140,8 @@ def require_disturbance(argument: str, W: Any, dimension: int) -> None:
     if not bounded:
         fail(argument, "is unbounded", "Bound every coordinate")
     if not held:
-        fail(argument, "does not hold the origin", "Add its center to the system's c")
+        cure = "Move it by -w for a w in it, and the system's c by w, or by E w"
+        fail(argument, "does not hold the origin", cure)
 
 
 def disturbance_set(W: Any, n: int, E: Reals | None = None) -> ConvexSet | None:

@@ -50,7 +50,7 @@ def plot(*sets: Any, ax: Any = None, **style: Any) -> Any:
         if not one.is_empty():
             own = {key: _own(value, i, len(sets)) for key, value in style.items()}
             own.setdefault("color", f"C{(used + i) % 10}")
-            (_draw_plane if n == 2 else _draw_space)(ax, one, view, **own)
+            _draw(ax, one, view, **own)
     for k, (axis, (low, high)) in enumerate(zip("xyz"[:n], view.T, strict=True)):
         if ax.get_autoscale_on():
             getattr(ax, f"set_{axis}lim")(low, high, auto=None)
@@ -109,11 +109,7 @@ def _corners(one: Any, view: np.ndarray) -> tuple[np.ndarray, bool]:
     return replace(whole, H=rows, h=offsets, labels=()).vertices(), True
 
 
-def _named(label: Any, cut: bool) -> Any:
-    return f"{label} (unbounded)" if cut and label else label
-
-
-def _draw_plane(
+def _draw(
     ax: Any,
     one: Any,
     view: np.ndarray,
@@ -123,68 +119,47 @@ def _draw_plane(
     label: Any = None,
     **style: Any,
 ) -> None:
-    if not hasattr(one, "vertices"):
+    plane = view.shape[1] == 2
+    if hasattr(one, "vertices"):
+        V, cut = _corners(one, view)
+    elif plane:
         V, cut = one.boundary(), False
     else:
-        V, cut = _corners(one, view)
-    label = _named(label, cut)
-    if len(V) == 0:
-        return
-    if len(V) < 3:
-        marker = {"marker": "o", "markersize": 4} if len(V) == 1 else {}
-        ax.plot(*V.T, color=color, label=label, **marker)
-        return
-    ax.fill(*V.T, facecolor=color, alpha=alpha, edgecolor="none", label=label, **style)
-    ring = np.vstack([V, V[:1]])
-    if not cut:
-        ax.plot(*ring.T, color=color, linewidth=1.2)
-        return
-    width = np.ptp(view, axis=0)
-    for start, end in zip(ring[:-1], ring[1:], strict=True):
-        sides = np.abs(np.array([start, end]) - view[:, None]) <= _ON * width
-        if not sides.all(axis=1).any():  # not both ends on one side of the picture
-            ax.plot(*np.array([start, end]).T, color=color, linewidth=1.2)
-
-
-def _draw_space(
-    ax: Any,
-    one: Any,
-    view: np.ndarray,
-    *,
-    color: Any,
-    alpha: float = 0.3,
-    label: Any = None,
-    **style: Any,
-) -> None:
-    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
-
-    if not hasattr(one, "vertices"):
         center, L = one._ball()
         u, v = np.meshgrid(np.linspace(0, 2 * np.pi, 41), np.linspace(0, np.pi, 21))
         ball = np.array([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)])
         surface = center[:, None, None] + np.tensordot(L, ball, 1)
         ax.plot_surface(*surface, color=color, alpha=alpha, label=label, **style)
         return
-    V, cut = _corners(one, view)
-    label = _named(label, cut)
+    label = f"{label} (unbounded)" if cut and label else label
     if len(V) == 0:
         return
-    faces = polygons(V)
+    faces = polygons(V) if not plane else [V] if len(V) > 2 else None
     if faces is None:  # a segment or a point
         marker = {"marker": "o", "markersize": 4} if len(V) == 1 else {}
         ax.plot(*V.T, color=color, label=label, **marker)
         return
     width = np.ptp(view, axis=0)
-    sides = [
-        (np.abs(face[:, None] - view) <= _ON * width).all(axis=0).any() if cut else False
-        for face in faces
-    ]
-    kept = [face for face, on in zip(faces, sides, strict=True) if not on]
-    ax.add_collection3d(
-        Poly3DCollection(
-            kept, facecolor=color, edgecolor=color, linewidth=0.7, alpha=alpha, label=label, **style
-        )
-    )
+    if not plane:
+        from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+        sides = [
+            (np.abs(face[:, None] - view) <= _ON * width).all(axis=0).any() if cut else False
+            for face in faces
+        ]
+        kept = [face for face, on in zip(faces, sides, strict=True) if not on]
+        lines = {"facecolor": color, "edgecolor": color, "linewidth": 0.7}
+        ax.add_collection3d(Poly3DCollection(kept, **lines, alpha=alpha, label=label, **style))
+        return
+    ax.fill(*V.T, facecolor=color, alpha=alpha, edgecolor="none", label=label, **style)
+    ring = np.vstack([V, V[:1]])
+    if not cut:
+        ax.plot(*ring.T, color=color, linewidth=1.2)
+        return
+    for start, end in zip(ring[:-1], ring[1:], strict=True):
+        sides = np.abs(np.array([start, end]) - view[:, None]) <= _ON * width
+        if not sides.all(axis=1).any():  # not both ends on one side of the picture
+            ax.plot(*np.array([start, end]).T, color=color, linewidth=1.2)
 
 
 def polygons(V: np.ndarray) -> list[np.ndarray] | None:

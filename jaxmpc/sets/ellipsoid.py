@@ -30,6 +30,7 @@ from jaxmpc.sets.fields import (
     section,
     vector,
 )
+from jaxmpc.sets.geometry import row_lengths
 from jaxmpc.sets.linear_sets import Box
 from jaxmpc.sets.lp import FLAT
 from jaxmpc.sets.operations import BasicSet, sample_size
@@ -151,7 +152,7 @@ class Ellipsoid(BasicSet):
         M, t = affine_map(M, t, (None, len(P)))
         L = np.linalg.solve(np.linalg.cholesky(P).T, np.eye(len(P)))  # x = center + L w
         root = M @ L
-        size = np.linalg.svd(root / _lengths(root, 1), compute_uv=False)
+        size = np.linalg.svd(root / row_lengths(root)[:, None], compute_uv=False)
         if len(M) > len(P) or not size[-1] > FLAT * size[0]:
             problem = f"has a rank below {len(M)}, so the image is flat, which no Ellipsoid is"
             fail("M", problem, "Map to fewer coordinates, or give a Zonotope")
@@ -165,7 +166,7 @@ class Ellipsoid(BasicSet):
         M, t = affine_map(M, t, (len(P), None))
         U = np.linalg.cholesky(P).T
         root, offset = U @ M, U @ (center - t)
-        size = np.linalg.svd(root / _lengths(root, 0), compute_uv=False)
+        size = np.linalg.svd(root / row_lengths(root.T), compute_uv=False)
         if M.shape[1] > len(P) or not size[-1] > FLAT * size[0]:
             problem = f"has a rank below {M.shape[1]}, so the set is unbounded"
             fail("M", problem, "Give a matrix of full column rank")
@@ -245,11 +246,6 @@ class Ellipsoid(BasicSet):
         P, level, center = self._values()
         return other.is_bounded() and other._farthest(P, center) <= level * (1 + tolerance)
 
-    def _keeps(self, rows: np.ndarray, offsets: np.ndarray, tolerance: float) -> bool:
-        reach = np.max(np.abs(self.bounding_box().bounds()), axis=0)
-        room = tolerance * (np.abs(offsets) + np.abs(rows) @ reach)
-        return bool(np.all(self.support(rows) <= offsets + room))
-
     def _farthest(self, P: np.ndarray, center: np.ndarray) -> float:
         # max |root w + offset|^2 over |w| <= 1: at (mu - D) w = g in coordinates of the
         # eigenvectors of root'root, mu > max D (Moré & Sorensen 1983, SIAM J. Sci. Comput. 4).
@@ -283,9 +279,3 @@ class Ellipsoid(BasicSet):
         require_shape(f"{argument}.level", as_array(self.level), (), "Give one number")
         if self.center is not None:
             require_shape(f"{argument}.center", self.center, shape[:1], "Give one entry a state")
-
-
-def _lengths(M: np.ndarray, axis: int) -> np.ndarray:
-    """Return the lengths of the rows (axis 1) or columns (0) of a matrix, 1 of those of zeros."""
-    length = np.linalg.norm(M, axis=axis, keepdims=True)
-    return np.where(length > 0, length, 1.0)

@@ -38,11 +38,11 @@ def product(xp: ModuleType, M: Any, v: Any) -> Any:
 def one_or_many(argument: str, value: Reals, n: int) -> tuple[Any, bool]:
     """Return an argument as an array of one vector (n,) or of many (k, n), and whether it is
     many."""
-    value = as_array(value)
-    many = np.ndim(as_array(value)) == 2
-    if not (many and np.shape(as_array(value))[1] == n):
-        require_shape(argument, value, (n,), "Give one (n,), or many as rows (k, n)")
-    return value, many
+    given: Any = as_array(value)
+    many = np.ndim(given) == 2
+    if not (many and np.shape(given)[1] == n):
+        require_shape(argument, given, (n,), "Give one (n,), or many as rows (k, n)")
+    return given, many
 
 
 def require_matching(

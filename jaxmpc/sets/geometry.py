@@ -289,6 +289,12 @@ def unit_rows(H: Any, h: Any, argument: str = "Polytope") -> tuple[np.ndarray, n
     return H / length[:, None], h / length
 
 
+def row_lengths(M: np.ndarray) -> np.ndarray:
+    """Return the norm of each row of M, and 1 for a row of zeros."""
+    length = np.linalg.norm(M, axis=1)
+    return np.where(length > 0, length, 1.0)
+
+
 def hull_volume(points: Reals, *, thin: bool = False) -> float:
     """Return the volume of the convex hull of points (k, n): 0 where they lie in a hyperplane.
 

@@ -166,19 +166,9 @@ class LinearSet(BasicSet):
         rows, offsets = self.to_polytope().unit_rows("other")
         return other._keeps(rows, offsets, tolerance)
 
-    def _keeps(self, rows: np.ndarray, offsets: np.ndarray, tolerance: float) -> bool:
-        room = self._room(rows, offsets, tolerance)
-        return bool(np.all(self.support(rows) <= offsets + room))
-
     def _farthest(self, P: np.ndarray, center: np.ndarray) -> float:
         apart = self.vertices() - center
         return float(np.einsum("ij,jk,ik->i", apart, P, apart).max())
-
-    def _room(self, rows: np.ndarray, offsets: np.ndarray, tolerance: float) -> np.ndarray:
-        """Return by how much each row may be exceeded: a fraction of its terms over the set."""
-        reach = np.max(np.abs(self.bounding_box().bounds()), axis=0)
-        terms = np.abs(offsets) + np.abs(rows) @ np.where(np.isinf(reach), 0.0, reach)
-        return tolerance * terms
 
 
 @record

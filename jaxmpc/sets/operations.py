@@ -120,9 +120,12 @@ class BasicSet(ConvexSet):
     def _covers(self, other: Any, tolerance: float) -> bool:
         """Return whether the set holds another, both not empty: `other.is_subset(self)`."""
 
-    @abstractmethod
     def _keeps(self, rows: np.ndarray, offsets: np.ndarray, tolerance: float) -> bool:
-        """Return whether all points keep unit rows x <= offsets, to a fraction of their terms."""
+        """Return whether all points keep unit rows x <= offsets, to a fraction of their terms over
+        the set."""
+        reach = np.max(np.abs(self.bounding_box().bounds()), axis=0)
+        terms = np.abs(offsets) + np.abs(rows) @ np.where(np.isinf(reach), 0.0, reach)
+        return bool(np.all(self.support(rows) <= offsets + tolerance * terms))
 
     @abstractmethod
     def _farthest(self, P: np.ndarray, center: np.ndarray) -> float:
@@ -188,15 +191,8 @@ class BasicSet(ConvexSet):
         return self.image(factor * np.eye(self.dimension))
 
     def plot(self, ax: Any = None, **style: Any) -> Any:
-        """Draw a set of two or three dimensions, and return the axes.
-
-        Arguments:
-            ax: axes of matplotlib, with projection="3d" for three dimensions; None for new ones.
-            style: `color`, `alpha`, `label`, and else what matplotlib's polygons take.
-
-        An unbounded set is cut off at the border of the picture, without an edge there, and its
-        label says so. Flat sets are drawn as lines and points, an empty one not at all.
-        """
+        """Draw a set of two or three dimensions, and return the axes; ax, style: as in
+        `jm.sets.plot`, which draws several."""
         return drawing.plot(self, ax=ax, **style)
 
     def __contains__(self, x: Any) -> bool:

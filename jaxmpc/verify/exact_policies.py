@@ -59,10 +59,11 @@ class Dyadic(NamedTuple):
         """Return the first rows, or entries."""
         return Dyadic(self.values[:count], self.e)
 
-    def above(self, other: "Dyadic") -> "Dyadic":
-        """Return two matrices or vectors, one above the other."""
+    def beside(self, other: "Dyadic", axis: int = 1) -> "Dyadic":
+        """Return two matrices side by side, or with axis 0, as vectors may be, one above the
+        other."""
         e = max(self.e, other.e)
-        return Dyadic(np.concatenate([self.over(e), other.over(e)]), e)
+        return Dyadic(np.concatenate([self.over(e), other.over(e)], axis), e)
 
     def columns(self, first: int, end: int | None) -> "Dyadic":
         """Return some of the columns."""
@@ -82,11 +83,6 @@ class Dyadic(NamedTuple):
         """Return the sum, or the difference."""
         e = max(self.e, other.e)
         return Dyadic(self.over(e) + sign * other.over(e), e)
-
-    def beside(self, other: "Dyadic") -> "Dyadic":
-        """Return two matrices side by side."""
-        e = max(self.e, other.e)
-        return Dyadic(np.hstack([self.over(e), other.over(e)]), e)
 
     def dot(self, other: "Dyadic") -> Fraction:
         """Return the sum of the products of their entries."""
@@ -238,7 +234,7 @@ class StoredPolicies:
             center, G = self.section
             off = center.plus(G.times(Dyadic.of(answer)))
             if len(x0) > self.states:  # the first rate is that of the input that is applied
-                off = off.above(self.gain.times(off))
+                off = off.beside(self.gain.times(off), 0)
             z = x.plus(off, -1)
         for k in range(p.N + 1):
             H = Dyadic.of(p.H[k])

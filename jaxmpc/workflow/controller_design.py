@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 from jaxmpc.arrays import Reals
-from jaxmpc.checks import fail, nearest
+from jaxmpc.checks import fail, nearest, require_kind
 from jaxmpc.explicit.exact_penalties import ExactPenalty, exact_penalty
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.problem import MPC, soften
@@ -76,9 +76,8 @@ def design(
     if limits is not None:
         if states is not None or inputs is not None:
             fail("limits", "given beside states or inputs", "Choose one way to give the limits")
-        if not isinstance(limits, JointLimits):
-            cure = "Give what jm.joint_limits returns, or states= and inputs="
-            fail("limits", f"is a {type(limits).__name__}", cure)
+        cure = "Give what jm.joint_limits returns, or states= and inputs="
+        require_kind("limits", limits, JointLimits, cure=cure)
         states, inputs = limits.states, limits.inputs
         if not system.state_names:
             named: dict[str, Any] = limits.names

@@ -592,6 +592,20 @@ def test_derivatives_of_a_batch_of_plans_without_limits():
         np.testing.assert_allclose(found, np.tile(np.eye(2) / 2, (3, 1, 1)), atol=1e-5)
 
 
+@pytest.mark.parametrize("name", ["Q", "R"])
+def test_traced_weights_leave_the_gain_of_known_dynamics(name):
+    """Without it 60 steps of an unstable plant are beyond the solver."""
+    system = jm.LinearSystem([[1.6, 0.3], [0.0, 1.4]], [[0.1], [0.5]])
+    mpc = jm.MPC(
+        system, np.eye(2), np.eye(1), 60, jm.Box([-1, -1], [1, 1]), jm.Box([-1], [1])
+    )  # fmt: skip
+    with jax.enable_x64(True):
+        plan = lambda weight: jm.solve(replace(mpc, **{name: weight}), np.array([0.02, -0.01]))
+        found, wanted = jax.jit(plan)(getattr(mpc, name)), plan(getattr(mpc, name))
+    assert found.status == wanted.status == jm.Status.SOLVED
+    np.testing.assert_allclose(found.cost, wanted.cost, rtol=1e-8)
+
+
 def test_gradients_of_all_data_are_traced():
     """Of the problem and the state; `TestEveryField` of `test_derivative.py` has values."""
     cost = lambda mpc, x: jm.solve(mpc, x).cost

@@ -13,7 +13,7 @@ from jaxmpc.app.options.shared import print_table
 from jaxmpc.checks import fail, require_memory
 from jaxmpc.closed_loop.disturbances import draw_disturbances, worst_disturbance
 from jaxmpc.closed_loop.simulation import Run, simulate
-from jaxmpc.files import as_json, open_folder, require_new, versions, write_arrays, write_json
+from jaxmpc.files import open_folder, require_new, versions, write_arrays, write_json
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.plan import broken_at_start
 from jaxmpc.mpc.problem import MPC, Outputs, as_tuple, output_stages
@@ -142,7 +142,7 @@ def simulate_problem(loops: LinearLoops, output: Path, overwrite: bool) -> None:
     }
     arrays = {"states": states, "inputs": inputs, "status": status, "disturbances": w}
     write_arrays(output / FILES[1], **arrays)
-    write_json(output / FILES[0], as_json(summary))
+    write_json(output / FILES[0], summary)
     meaning = {
         "vertices": "random vertices at each step: a sample, no proof",
         "inside": "random points at each step: a sample, no proof",

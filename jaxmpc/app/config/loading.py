@@ -302,10 +302,9 @@ def check(config: Config, command: str = "sweep") -> None:
         ("reference.state", None if target is None else target.state, n),
         ("reference.input", None if target is None else target.input, m),
     ):
-        if value is not None and len(value) != count:
-            inputs = counted(m, "input")
-            what = inputs if count == m != n else f"{counted(n, 'state')}, {inputs}"
-            fail(key, f"has {len(value)} entries where {count} are needed", f"A, B: {what}")
+        inputs = counted(m, "input")
+        what = inputs if count == m != n else f"{counted(n, 'state')}, {inputs}"
+        _check_length(key, value, count, f"A, B: {what}")
     _check_order("limits", limits, "x_min", "x_max")
     _check_order("limits", limits, "u_min", "u_max")
     _check_state_limits(config)
@@ -321,22 +320,18 @@ def check(config: Config, command: str = "sweep") -> None:
             value = getattr(given, key)
             if value is not None and np.shape(value) != shape:
                 fail(f"disturbance.{key}", f"shape {np.shape(value)}", cure)
-        for key, size in (("w_min", p), ("w_max", p)):
-            if len(getattr(given, key)) != size:
-                what = f"has {len(getattr(given, key))} entries where {size} are needed"
-                fail(f"disturbance.{key}", what, "One for each column of E, without E each state")
+        for key in ("w_min", "w_max"):
+            cure = "One for each column of E, without E each state"
+            _check_length(f"disturbance.{key}", getattr(given, key), p, cure)
     for i, rows in enumerate(config.outputs):
         where = f"outputs.{i}"
         if rows.lower is None and rows.upper is None:
             fail(where, "has neither lower nor upper", "Give one of them, or both")
         if rows.quadratic is not None and rows.rho is None:
             fail(f"{where}.quadratic", "given without rho", "Soft rows have a weight rho")
-        p = len(rows.C)
-        for key, size in (("lower", p), ("upper", p), ("D", p), ("names", p), ("units", p)):
-            value = getattr(rows, key)
-            if value and len(value) != size:
-                what = f"has {len(value)} entries where {size} are needed"
-                fail(f"{where}.{key}", what, "One for each row of C")
+        for key in ("lower", "upper", "D", "names", "units"):
+            value = getattr(rows, key) or None
+            _check_length(f"{where}.{key}", value, len(rows.C), "One for each row of C")
         for key, size in (("C", n), ("D", m)):
             value = getattr(rows, key)
             if value is not None and len(value[0]) != size:
@@ -390,10 +385,7 @@ def _check_recursion(config: Config, n: int) -> None:
     """Raise ValueError unless [recursion] fits a system of n states."""
     recursion = config.recursion
     for key in ("grid", "lower", "upper"):
-        value = getattr(recursion, key)
-        if value is not None and len(value) != n:
-            what = f"has {len(value)} entries where {n} are needed"
-            fail(f"recursion.{key}", what, "One for each state")
+        _check_length(f"recursion.{key}", getattr(recursion, key), n, "One for each state")
     _check_order("recursion", recursion, "lower", "upper")
     shape = recursion_shape(config)
     if shape is not None:
@@ -451,6 +443,12 @@ def _check_rows(key: str, H: Any, h: Any, n: int, cure: str) -> None:
     """Raise ValueError unless H, where given, has a row of n entries for each entry of h."""
     if H is not None and np.shape(H) != (len(h), n):
         fail(key, f"shape {np.shape(H)} for {len(h)} rows", cure)
+
+
+def _check_length(key: str, value: Any, count: int, cure: str) -> None:
+    """Raise ValueError unless a list, where given, has so many entries."""
+    if value is not None and len(value) != count:
+        fail(key, f"has {len(value)} entries where {count} are needed", cure)
 
 
 def _check_order(where: str, section: Any, low: str, high: str) -> None:

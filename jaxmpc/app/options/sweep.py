@@ -107,7 +107,6 @@ class SweepOptions:
     output: Annotated[Path, option("DIR", "jaxmpc-sweep")] = Path("jaxmpc-sweep")
     """Folder for sweep.zarr, map.png and summary.json; made where absent."""
     horizon: Horizon = None
-    """Prediction horizon, in steps of dt."""
     terminal: Terminal = None
     grid: Annotated[tuple[int, ...] | None, option("K [K ...]", "from the file, else 256 256")] = (
         None

@@ -25,7 +25,7 @@ from jax import Array
 
 from jaxmpc.qp.jax_transformations import on_gpu, varying, with_derivative_of
 from jaxmpc.qp.kernel import EXACT, barrier, call, dot, indices, load, padded_side, program, store
-from jaxmpc.qp.linalg import WAITS, batched, inverse_root_side_by_side, matmul, solve
+from jaxmpc.qp.linalg import WAITS, batched, by_step, inverse_root_side_by_side, matmul, solve
 
 # Numbers along a side that a warp's registers hold.
 MOST_SIDE = 32
@@ -137,11 +137,11 @@ def _tracking_by(
 
 def _riccati_scan(Q: Array, R: Array, A: Array, B: Array, cross: Any = None) -> Gains:
     n, identity = Q.shape[-1], jnp.eye(R.shape[-1], dtype=Q.dtype)
-    fixed = (A if A.ndim == 2 else None, B if B.ndim == 2 else None)
+    own, at = by_step((A, 2), (B, 2))
 
     def stage(S: Array, stage: tuple) -> tuple[Array, Gains]:
         Q, R, M, *own = stage
-        A, B = (v if f is None else f for v, f in zip(own, fixed, strict=True))
+        A, B = at(own)
         BtS = matmul(B.T, S)
         Y = matmul(BtS, A) + (0.0 if M is None else M)
         solved = solve(R + matmul(BtS, B), jnp.concatenate([Y, identity], axis=1))
@@ -153,13 +153,12 @@ def _riccati_scan(Q: Array, R: Array, A: Array, B: Array, cross: Any = None) -> 
             S = S + matmul(K.T, M) + matmul(M.T, K)
         return (S + S.T) / 2, Gains(closed, K, inverse)
 
-    own = (v if f is None else None for v, f in zip((A, B), fixed, strict=True))
     return jax.lax.scan(stage, Q[-1], (Q[:-1], R, cross, *own), reverse=True)[1]
 
 
 def _riccati_lanes(Q: Array, R: Array, A: Array, B: Array) -> Gains:
     """The recursion for problems side by side: all arrays with the batch as last axis."""
-    fixed = (A if A.ndim == 3 else None, B if B.ndim == 3 else None)
+    own, at = by_step((A, 3), (B, 3))
     # Each product is an array of its own: XLA would compute it again for each of its uses.
     keep = jax.lax.optimization_barrier
     times = lambda X, Y: keep(sum(X[:, k, None] * Y[k] for k in range(len(Y))))
@@ -167,7 +166,7 @@ def _riccati_lanes(Q: Array, R: Array, A: Array, B: Array) -> Gains:
 
     def stage(S: Array, stage: tuple) -> tuple[Array, Gains]:
         Q, R, *own = stage
-        A, B = (v if f is None else f for v, f in zip(own, fixed, strict=True))
+        A, B = at(own)
         BtS = turned(B, S)
         W = inverse_root_side_by_side(R + times(BtS, B))
         inverse = turned(W, W)
@@ -176,7 +175,6 @@ def _riccati_lanes(Q: Array, R: Array, A: Array, B: Array) -> Gains:
         S = Q + turned(closed, times(S, closed)) + turned(K, times(R, K))
         return keep((S + S.swapaxes(0, 1)) / 2), Gains(closed, K, inverse)
 
-    own = (v if f is None else None for v, f in zip((A, B), fixed, strict=True))
     return jax.lax.scan(stage, Q[-1], (Q[:-1], R, *own), reverse=True)[1]
 
 
