@@ -1,9 +1,11 @@
 """Closed loops of many robots in a store: block by block, resumed after an interruption."""
 
+import inspect
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from functools import partial
 from pathlib import Path
+from types import CodeType, FunctionType, MethodType
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -70,7 +72,8 @@ def simulate_into(
         `simulate_many`. Runs are in the precision of the controller.
     factors: by which the plants differ from the robot, of `draw_factors`.
     settings: JSON data that determine the runs: a store with others is refused. None: hashes of
-        controller, model, references and factors.
+        controller, model, references and factors. Of functions, such as those of tasks, it is their
+        own code and what they close over: functions that they call are taken to be as before.
     chunk: robots of a block, which run at once, and are written at once while the next ones run: a
         killed run loses the block that runs and those being written (`store.BlockWriter`).
     resume: go on with the runs at `path`. overwrite: put new ones in their place, once their first
@@ -127,7 +130,7 @@ class _Loops:
         """Return what determines the runs, as hashes."""
         aims = (self.target["reference"], self.target["input_reference"])
         data = jax.tree.leaves((self.controller, aims, self.factors))
-        data_hash = fingerprint(_constants(self.controller), data)
+        data_hash = fingerprint(plain_data(self.controller), data)
         robot = self.robot
         plant = fingerprint(
             repr(sorted(robot.numbers)), [robot.dt, *jax.tree.leaves(robot.numbers)]
@@ -177,11 +180,29 @@ class _Loops:
         writer.put(part.place, rows, **runs, **own)
 
 
-def _constants(value: Any) -> Any:
-    """Return what is no array in a dataclass as JSON data: numbers, texts, and names of types."""
-    if is_dataclass(value):
-        return {field.name: _constants(getattr(value, field.name)) for field in fields(value)}
+def plain_data(value: Any) -> Any:
+    """Return what is no array in a dataclass as JSON data: numbers, texts, what functions do, and
+    names of other types."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return {field.name: plain_data(getattr(value, field.name)) for field in fields(value)}
     if isinstance(value, tuple):
-        return [_constants(part) for part in value]
+        return [plain_data(part) for part in value]
+    if isinstance(value, partial):
+        return plain_data((value.func, value.args, *sorted(value.keywords.items())))
+    if isinstance(function := inspect.unwrap(value) if callable(value) else value, MethodType):
+        return plain_data((function.__self__, function.__func__))
+    if isinstance(function, FunctionType):
+        closed_over = [cell.cell_contents for cell in function.__closure__ or ()]
+        held = jax.tree.leaves((closed_over, function.__defaults__, function.__kwdefaults__))
+        arrays = [v for v in held if isinstance(v, np.ndarray | np.generic | jax.Array)]
+        others = [plain_data(v) for v in held if not isinstance(v, jax.Array | np.ndarray)]
+        return [_plain_code(function.__code__), others, fingerprint(None, arrays)]
     plain = value is None or isinstance(value, bool | int | float | str)
     return value if plain else type(value).__name__
+
+
+def _plain_code(code: CodeType) -> list[Any]:
+    """Return the instructions of a function, and the names and constants in them, as JSON data."""
+    ordered = lambda v: sorted(map(repr, v)) if isinstance(v, frozenset) else repr(v)
+    constants = [_plain_code(v) if isinstance(v, CodeType) else ordered(v) for v in code.co_consts]
+    return [code.co_code.hex(), list(code.co_names), constants]

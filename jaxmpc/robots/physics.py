@@ -15,9 +15,9 @@ from jax.extend.core.primitives import acos_p, sqrt_p
 
 from jaxmpc.checks import fail
 from jaxmpc.qp.linalg import matmul, solve, stand_ins
-from jaxmpc.robots.configurations import normalised, rates, retract
+from jaxmpc.robots.configurations import difference, normalised, product, rates, retract
 from jaxmpc.robots.jaxpr_rewriting import in_pieces, moving, rewritten, with_forward_jacobian
-from jaxmpc.robots.mujoco_access import BALL, mjx_module, mujoco
+from jaxmpc.robots.mujoco_access import BALL, FREE, mjx_module, mujoco
 from jaxmpc.robots.parameters import DIRECTIONS, FRICTIONS, NO_FRICTION, PAYLOAD, acting_fields
 from jaxmpc.robots.rigid_bodies import (
     FIELDS,
@@ -31,9 +31,9 @@ from jaxmpc.robots.rigid_bodies import (
 # mjtIntegrator.
 EULER, RK4 = 0, 1
 
-# mjtDisableBit, mjtEq, the last mjtTrn of a joint.
-NO_GRAVITY, NO_EULER_DAMPING = 128, 32768
-EQUALITY_OF_JOINTS, TRANSMISSION_BY_JOINT = 2, 1
+# mjtDisableBit, mjtEq, the last mjtTrn of a joint, and that of a site.
+NO_SPRINGS, NO_GRAVITY, NO_EULER_DAMPING = 32, 128, 32768
+EQUALITY_OF_JOINTS, TRANSMISSION_BY_JOINT, TRANSMISSION_BY_SITE = 2, 1, 4
 # mjtJacobian.
 DENSE = 0
 
@@ -262,10 +262,10 @@ class Physics:
             data = data.tree_replace(self._dynamics(numbers, q, v)[2])
             data = mjx.tendon(model, data)
             data = mjx.collision(model, data) if self.rows else data
-        data = mjx.transmission(model, mjx.make_constraint(model, data))
+        data = self._with_lengths(model, mjx.transmission(model, mjx.make_constraint(model, data)))
         speeds = {"actuator_velocity": data._impl.actuator_moment, "ten_velocity": data._impl.ten_J}
         data = data.tree_replace({f"_impl.{name}": matmul(J, v) for name, J in speeds.items()})
-        data = mjx.fwd_actuation(model, mjx.passive(model, data))
+        data = mjx.fwd_actuation(model, self._with_passive_forces(model, data))
         force = data.qfrc_passive + data.qfrc_actuator
         if self.model.ntendon:
             force = force - mjx.tendon_bias(model, data).qfrc_bias
@@ -279,6 +279,52 @@ class Physics:
             names = ("efc_J", "efc_D", "efc_aref")
             data = data.tree_replace({f"_impl.{n}": constant(getattr(rows, n)) for n in names})
         return model, data
+
+    def _with_passive_forces(self, model: Any, data: Any) -> Any:
+        """Return mjx.Data with the forces of springs, dampers, fluids and gravity compensation.
+
+        MJX's springs of orientations and tendons have the derivative 0 at rest: of a rotation by
+        nothing there is no axis, and the two ends of a tendon's rest length are cases that exclude
+        their end. Their forces are -k (q - q_rest) and -k J'(l - l_rest).
+        """
+        mjx, host = mjx_module(), self.model
+        turning = np.isin(host.jnt_type, (FREE, BALL))
+        stiff = np.any(host.jnt_stiffness[turning]) or np.any(host.tendon_stiffness)
+        if not stiff or host.opt.disableflags & NO_SPRINGS:
+            return mjx.passive(model, data)
+        others = jnp.where(turning, 0, model.jnt_stiffness)
+        none = jnp.zeros_like(model.tendon_stiffness)
+        bare = model.replace(jnt_stiffness=others, tendon_stiffness=none)
+        data, length = mjx.passive(bare, data), data.ten_length
+        stiffness = (model.jnt_stiffness - others)[host.dof_jntid]
+        force = -stiffness * difference(self.joints, model.qpos_spring, data.qpos)
+        lower, upper = model.tendon_lengthspring.T
+        rest = jnp.where(lower == upper, lower, jnp.clip(length, lower, upper))
+        force = force + matmul(data._impl.ten_J.T, model.tendon_stiffness * (rest - length))
+        return data.replace(qfrc_passive=data.qfrc_passive + force)
+
+    def _with_lengths(self, model: Any, data: Any) -> Any:
+        """Return mjx.Data with the lengths of actuators of ball joints, and of sites relative to
+        others, by rotation vectors that have derivatives at 0 too."""
+        host, lengths = self.model, data.actuator_length
+        rotation = partial(difference, (BALL,))
+        for i, (kind, (at, base)) in enumerate(
+            zip(host.actuator_trntype, host.actuator_trnid, strict=True)
+        ):
+            gear = model.actuator_gear[i]
+            if kind == TRANSMISSION_BY_SITE and base >= 0 and np.any(host.actuator_gear[i, 3:]):
+                frames = [product(data.xquat[host.site_bodyid[s]], model.site_quat[s])
+                          for s in (base, at)]  # fmt: skip
+                apart = matmul(data.site_xmat[base].T, data.site_xpos[at] - data.site_xpos[base])
+                turned = jnp.concatenate([apart, rotation(*frames)])
+            elif kind <= TRANSMISSION_BY_JOINT and host.jnt_type[at] == BALL:
+                begin = host.jnt_qposadr[at]
+                none = jnp.eye(4, dtype=data.qpos.dtype)[0]
+                turned, gear = rotation(none, data.qpos[begin : begin + 4]), gear[:3]
+            else:
+                continue
+            lengths = lengths.at[i].set(jnp.dot(gear, turned))
+        return data.replace(actuator_length=lengths)
 
     def _rigid(self, function: Callable, numbers: dict[str, Array], q: Array, *rest: Array) -> Any:
         """Return what a function of `rigid_bodies.py` does."""

@@ -1,5 +1,9 @@
 """Robot runs in a store, from Python: what the command `jaxmpc simulate` calls."""
 
+import json
+from functools import partial
+
+import jax
 import numpy as np
 import pytest
 import xarray as xr
@@ -13,7 +17,9 @@ from jaxmpc.closed_loop import (
     stored_runs,
     summarise_runs,
 )
+from jaxmpc.closed_loop.stored_runs import plain_data
 from jaxmpc.closed_loop.variations import plant_numbers
+from jaxmpc.mpc import Task
 
 STEPS = 400
 
@@ -77,6 +83,31 @@ def test_runs_are_stored_resumed_and_those_of_simulate_many(tmp_path, monkeypatc
     options["factors"] = {name: v[:3] for name, v in factors.items()}
     again = simulate_into(path, feedback, joint, x0s[:3], STEPS, overwrite=True, **options)
     assert again.run.states.shape == (3, STEPS + 1, 2) and again.timing.count == 3
+
+
+def test_functions_are_told_apart_by_what_they_do(joint, feedback):
+    """Tasks and models of controllers: a store of others would be gone on with."""
+
+    def measured(i, scale=1.0, weights=(1.0, 2.0)):
+        held = np.array(weights)
+        return lambda d: scale * held[i] * d.site_xpos[0, i : i + 1]
+
+    class Tilted:
+        def value(self, d):
+            return d.xpos[0]
+
+    alike = [lambda: measured(0), lambda: partial(measured(0), 1.0), lambda: jax.jit(measured(0))]
+    for made in alike:
+        assert plain_data(made()) == plain_data(made())
+    others = [
+        measured(0), measured(1), measured(0, 2.0), measured(0, weights=(1.0, 3.0)),
+        partial(measured(0), 1.0), partial(measured(0), 2.0), partial(measured(0), d=1.0),
+        lambda d: d.xpos[0], lambda d: d.xpos[1], lambda d, k=2: d.xpos[k],
+        lambda d, k=3: d.xpos[k], lambda d: d.site_xpos[0], lambda d: (lambda k: d.xpos[k])(1),
+        lambda d: (lambda k: d.xpos[k])(2), Tilted().value,
+    ]  # fmt: skip
+    seen = [json.dumps(plain_data(Task(function, weight=1.0))) for function in others]
+    assert len(set(seen)) == len(seen)
 
 
 def test_summary_says_what_the_states_say(joint, feedback):

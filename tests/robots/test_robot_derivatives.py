@@ -44,6 +44,44 @@ def assert_close(found, wanted, tolerance=1e-6):
         np.testing.assert_allclose(a, b, rtol=0, atol=tolerance * size)
 
 
+# --- at rest ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("integrator", ["Euler", pytest.param("RK4", marks=pytest.mark.slow)])
+def test_springs_at_their_rest(integrator):
+    """At home no spring pulls, which MJX takes for no stiffness: of orientations, of tendons, and
+    of servos of both. Against mjd_transitionFD, and from a state near by."""
+    box = '<geom type="box" size=".1 .2 .15" mass="1"/>'
+    model = mujoco.MjModel.from_xml_string(f"""
+        <mujoco><option timestep="0.005" gravity="0 0 0" integrator="{integrator}"/>
+        <default><geom contype="0" conaffinity="0"/></default>
+        <worldbody><site name="w" pos="0 .1 .5"/>
+        <body quat=".9 .1 .3 .2"><joint name="ball" type="ball" stiffness="2"/>{box}
+          <body pos=".3 0 0" quat=".8 0 .6 0"><joint name="held" type="ball"/>{box}
+            <site name="hand" pos="0 0 .2"/></body></body>
+        <body pos="1 0 0"><joint name="free" type="free" stiffness="3"/>{box}
+          <site name="mast" quat=".6 0 0 .8"/></body>
+        <body pos="0 1 0"><joint name="a" axis="0 1 0"/>{box}
+          <body pos=".3 0 0"><joint name="b" axis="0 0 1"/>{box}
+            <site name="tip" pos=".2 0 0"/></body>
+        </body></worldbody>
+        <tendon>
+          <fixed stiffness="5"><joint joint="a" coef="1"/><joint joint="b" coef="-.5"/></fixed>
+          <spatial stiffness="4" damping=".1"><site site="w"/><site site="tip"/></spatial>
+          <fixed name="t"><joint joint="b" coef="2"/></fixed></tendon>
+        <actuator><position joint="held" kp="2" gear="1 0 .3"/>
+          <position jointinparent="held" kp="1" gear="0 1 0"/>
+          <position site="mast" refsite="w" kp="3" gear=".5 0 0 0 1 .2"/>
+          <position tendon="t" kp="2"/></actuator></mujoco>""")
+    robot = jm.load_robot(model)
+    home, u = np.asarray(robot.home, float), np.zeros(robot.m)
+    moved = np.random.default_rng(0).uniform(-1e-3, 1e-3, robot.n)
+    with jax.enable_x64(True):
+        transition = jax.jit(robot.transition)
+        for x in (home, np.asarray(robot.state(robot.coordinates(home) + moved))):
+            assert_close(transition(x, u), c_transition(robot, x, u))
+
+
 # --- both precisions -------------------------------------------------------------------------
 
 
