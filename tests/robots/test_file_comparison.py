@@ -548,3 +548,21 @@ def test_equal_models_are_compared_once(monkeypatch):
     assert len(calls) == 1
     jm.load_robot("pendulum", timestep=0.0005, control_period=0.01)
     assert len(calls) == 2
+
+
+def test_feet_that_only_touch():
+    """At home rounding decides which feet touch, one of six in MuJoCo here: no difference."""
+    legs = "".join(
+        f"""
+        <body euler="0 0 {60 * i + 30}" pos="0 0 .03"><joint name="n{i}" axis="0 1 0"/>
+        <geom type="sphere" size=".02" pos=".3 0 -.15" mass=".1"/></body>"""
+        for i in range(6)
+    )
+    model = mujoco.MjModel.from_xml_string(f"""
+        <mujoco><worldbody><geom type="plane" size="5 5 .1"/>
+        <body pos="1.5 -.7 .14" euler="0 0 40"><freejoint/>
+        <geom type="cylinder" size=".1 .02" mass="1"/>{legs}</body></worldbody>
+        <actuator><motor joint="n0" ctrlrange="-1 1"/></actuator></mujoco>""")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        jm.load_robot(model)
