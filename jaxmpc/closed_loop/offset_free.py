@@ -248,12 +248,12 @@ def augmented(mpc: MPC, observer: KalmanFilter) -> MPC:
         state_units=units,
     )
     wider = partial(_with_columns, k=k)
-    P = mpc.terminal_cost
+    weight = lambda M: np.pad(np.asarray(M), (0, k)) if concrete(M) else jnp.pad(M, (0, k))
     return replace(
         mpc,
         system=more,
-        Q=np.pad(np.asarray(mpc.Q), (0, k)),
-        terminal_cost=None if P is None else np.pad(np.asarray(P), (0, k)),
+        Q=weight(mpc.Q),
+        terminal_cost=None if mpc.terminal_cost is None else weight(mpc.terminal_cost),
         states=wider(mpc.states),
         terminal_set=wider(mpc.terminal_set),
         soft=tuple(wider(rows) for rows in as_tuple("soft", mpc.soft, Soft)),

@@ -180,20 +180,21 @@ def prestabilising_gain(mpc: MPC) -> Any:
     for each step, (N, m, n), where the system differs from step to step. Raises ValueError where it
     is True and there is no LQR; none if A and B are traced then."""
     wish, none = mpc.prestabilise, np.zeros((mpc.system.m, mpc.system.n))
+    system = replace(mpc.system, c=None)
     if not isinstance(wish, Switch | None):
         return wish
     if mpc.control_horizon is not None or (wish is not None and not wish.on):
         return none
     # Any stabilising gain serves; a little weight on every state makes the DARE solvable.
-    Q, R = np.eye(mpc.system.n), np.eye(mpc.system.m)
+    Q, R = np.eye(system.n), np.eye(system.m)
     if {"system.A", "system.B"} & set(mpc.varying):
-        return _gains_by_step(mpc)
-    if not concrete(mpc.system.A, mpc.system.B):
+        return _gains_by_step(replace(mpc, system=system))
+    if not concrete(system):
         if wish is None:
             return none
-        K = jax.lax.stop_gradient(jnp.asarray(lqr(mpc.system, Q, R).K))
+        K = jax.lax.stop_gradient(jnp.asarray(lqr(system, Q, R).K))
         return jnp.where(jnp.all(jnp.isfinite(K)), K, 0.0)
-    A, B, _ = host_matrices(mpc.system)
+    A, B, _ = host_matrices(system)
     if wish is None and spectral_radius(A) <= 1 + 1e-9:
         return none
     if concrete(mpc.Q, mpc.R) and np.ndim(mpc.Q) == np.ndim(mpc.R) == 2:
@@ -203,7 +204,7 @@ def prestabilising_gain(mpc: MPC) -> Any:
     if np.linalg.eigvalsh((R + R.T) / 2)[0] <= 0:
         R = R + 1e-3 * np.diag(np.diag(B.T @ Q @ B))
     try:
-        return lqr(mpc.system, Q, R).K
+        return lqr(system, Q, R).K
     except ValueError:
         if wish is None:
             return none

@@ -176,10 +176,11 @@ def require_generators(W: Any) -> None:
 def tube_section(mpc: MPC) -> Zonotope:
     """Return the cross-section S of a tube. Raises ValueError where dynamics, gain or disturbances
     are traced, and as `minimal_robust_invariant_set`."""
-    if not concrete(mpc.system, mpc.disturbance, mpc.disturbance_matrix, mpc.gain):
+    plant = replace(mpc.system, c=None)
+    if not concrete(plant, mpc.disturbance, mpc.disturbance_matrix, mpc.gain):
         cure = "Give gain=K (None is the LQR of Q and R), or a Controller made outside of the trace"
         fail("policy", "'tube' beside traced dynamics, gain or disturbances", cure)
-    gain, plant = np.asarray(feedback_gain(mpc), float), replace(mpc.system, c=None)
+    gain = np.asarray(feedback_gain(mpc), float)
     A, B, _ = host_matrices(plant)
     require_stable("gain", A + B @ gain)
     found = minimal_robust_invariant_set(

@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
@@ -71,6 +72,7 @@ def lqr(system: LinearSystem, Q: Reals, R: Reals) -> LQR:
     arXiv:2011.11430, for the derivative.
     """
     require_kind("system", system, LinearSystem)
+    system = replace(system, c=None)
     system.validate()
     n, m = system.n, system.m
     Q, R = as_weight(Q, n), as_weight(R, m)

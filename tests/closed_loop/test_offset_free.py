@@ -350,6 +350,16 @@ def test_feasible_sets_with_a_disturbance_as_parameter():
         np.testing.assert_array_equal(found.label[~edge], np.where(inside, 1, -1)[~edge])
 
 
+def test_augmented_problems_take_traced_weights():
+    mpc, filter_ = MPC, observer(Disturbance("input", 1.0))
+    wanted = augmented(mpc, filter_)
+    for name in ("Q", "terminal_cost"):
+        found = jax.jit(lambda v, name=name: augmented(replace(mpc, **{name: v}), filter_))(
+            np.eye(mpc.system.n)
+        )
+        np.testing.assert_array_equal(np.shape(getattr(found, name)), np.shape(wanted.Q))
+
+
 @pytest.mark.slow
 def test_augmented_problem_gives_the_same_plans(controller, tmp_path):
     """With (x, d) as its state and the target as its reference; so exported programs do."""

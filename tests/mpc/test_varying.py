@@ -221,6 +221,53 @@ def test_constant_data_with_a_leading_axis_change_nothing():
     assert np.shape(prestabilising_gain(replace(same, control_horizon=None))) == (6, 1, 2)
 
 
+ALONE = ("system.A", "system.B", "system.c", "Q", "R", "terminal_cost", "states.upper")
+
+
+def growing(name, value=None):
+    """An unstable problem, and with another value of one of its fields."""
+    mpc = jm.MPC(
+        jm.LinearSystem([[1.2, 0.1], [0, 1.1]], [[0.0], [0.1]], [0.01, 0]), np.eye(2), [[0.1]], 6,
+        jm.Box([-2, -2], [2, 2]), jm.Box([-1], [1]), terminal_cost=np.eye(2),
+    )  # fmt: skip
+    part, _, field = name.rpartition(".")
+    held = getattr(mpc, part) if part else mpc
+    if value is None:
+        return mpc, np.asarray(getattr(held, field))
+    return replace(mpc, **({part: replace(held, **{field: value})} if part else {name: value}))
+
+
+@pytest.mark.parametrize("name", [name for name in ALONE if name != "terminal_cost"])
+def test_one_field_alone_may_differ_from_step_to_step(name):
+    """Where it differs by nothing the problem is the same, but for the gain that it has too."""
+    one, value = growing(name)
+    steps = one.horizon + (name == "states.upper")
+    same = growing(name, np.repeat(value[None], steps, axis=0))
+    assert np.any(prestabilising_gain(same))
+    plain, found = (condense(replace(mpc, prestabilise=False)) for mpc in (one, same))
+    for field in ("Gamma", "Phi", "phi", "Omega", "P", "F", "f"):
+        wanted = getattr(plain, field)
+        np.testing.assert_allclose(getattr(found, field), wanted, rtol=1e-12, atol=1e-13)
+    condense(same)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ALONE)
+def test_one_field_alone_may_be_traced(name):
+    """The same plan and derivative as of concrete data, of 40 steps of an unstable plant."""
+    long = lambda value: replace(growing(name, value), horizon=40)
+    if name in ("system.A", "system.B"):  # whose gain is asked for inside a trace
+        long = lambda value: replace(growing(name, value), horizon=40, prestabilise=True)
+    _, value = growing(name)
+    cost, x = lambda value: jm.solve(long(value), x).cost, np.array([0.02, 0.03])
+    found, slope = jax.jit(jax.value_and_grad(cost))(value)
+    np.testing.assert_allclose(found, cost(value), rtol=1e-8)
+    way = np.random.default_rng(0).normal(size=value.shape)
+    way = way @ way.T if name in ("Q", "R", "terminal_cost") else way
+    apart = (cost(value + 1e-5 * way) - cost(value - 1e-5 * way)) / 2e-5
+    np.testing.assert_allclose(np.sum(slope * way), apart, rtol=1e-5, atol=1e-7)
+
+
 def test_a_gain_for_each_step_changes_rounding_alone():
     mpc = varying(soft=(), outputs=())
     gains = 0.3 * np.random.default_rng(2).normal(size=(N, m, n))
