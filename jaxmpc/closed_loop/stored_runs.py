@@ -188,17 +188,23 @@ def plain_data(value: Any) -> Any:
     if isinstance(value, tuple):
         return [plain_data(part) for part in value]
     if isinstance(value, partial):
-        return plain_data((value.func, value.args, *sorted(value.keywords.items())))
+        return [plain_data(value.func), _held(value.args, *sorted(value.keywords.items()))]
     if isinstance(function := inspect.unwrap(value) if callable(value) else value, MethodType):
-        return plain_data((function.__self__, function.__func__))
+        return [plain_data(function.__func__), _held(function.__self__)]
     if isinstance(function, FunctionType):
         closed_over = [cell.cell_contents for cell in function.__closure__ or ()]
-        held = jax.tree.leaves((closed_over, function.__defaults__, function.__kwdefaults__))
-        arrays = [v for v in held if isinstance(v, np.ndarray | np.generic | jax.Array)]
-        others = [plain_data(v) for v in held if not isinstance(v, jax.Array | np.ndarray)]
-        return [_plain_code(function.__code__), others, fingerprint(None, arrays)]
+        held = _held(closed_over, function.__defaults__, function.__kwdefaults__)
+        return [_plain_code(function.__code__), held]
     plain = value is None or isinstance(value, bool | int | float | str)
     return value if plain else type(value).__name__
+
+
+def _held(*values: Any) -> list[Any]:
+    """Return what a function has beside its code as JSON data: the hash of arrays, and the rest."""
+    held = jax.tree.leaves(values)
+    arrays = [v for v in held if isinstance(v, np.ndarray | np.generic | jax.Array)]
+    others = [v for v in held if not isinstance(v, np.ndarray | np.generic | jax.Array)]
+    return [*map(plain_data, others), fingerprint(None, arrays)]
 
 
 def _plain_code(code: CodeType) -> list[Any]:

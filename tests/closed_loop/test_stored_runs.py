@@ -102,6 +102,7 @@ def test_functions_are_told_apart_by_what_they_do(joint, feedback):
     others = [
         measured(0), measured(1), measured(0, 2.0), measured(0, weights=(1.0, 3.0)),
         partial(measured(0), 1.0), partial(measured(0), 2.0), partial(measured(0), d=1.0),
+        partial(measured(0), np.ones(2)), partial(measured(0), np.zeros(2)),
         lambda d: d.xpos[0], lambda d: d.xpos[1], lambda d, k=2: d.xpos[k],
         lambda d, k=3: d.xpos[k], lambda d: d.site_xpos[0], lambda d: (lambda k: d.xpos[k])(1),
         lambda d: (lambda k: d.xpos[k])(2), Tilted().value,
