@@ -79,24 +79,29 @@ def stack_horizons(problems: Sequence[MPC]) -> MPC:
     return jax.tree.map(lambda *v: stack(v), *padded)
 
 
+def module_of(*values: Any) -> ModuleType:
+    """Return NumPy where none of the values is being traced, else `jax.numpy`."""
+    return np if concrete(*values) else jnp
+
+
 class _Padding:
-    """A problem, the length that it gets, and the module of its arrays."""
+    """A problem, and the length that it gets. What is known stays known beside what is traced."""
 
     def __init__(self, mpc: MPC, horizon: int) -> None:
         self.mpc, self.horizon = mpc, horizon
-        self.xp: ModuleType = np if concrete(mpc) else jnp
 
     def each(self, value: Any, axes: int, steps: int) -> Any:
         """Return an array that has so many axes at one step as one for each of some steps."""
-        value = self.xp.asarray(value)
-        return value if value.ndim > axes else self.xp.broadcast_to(value, (steps, *value.shape))
+        xp = module_of(value)
+        value = xp.asarray(value)
+        return value if value.ndim > axes else xp.broadcast_to(value, (steps, *value.shape))
 
     def longer(self, value: Any, axes: int, filler: Any) -> Any:
         """Return data of N steps with the filler at each step that is added."""
         found = self.each(value, axes, self.mpc.horizon)
         added = self.horizon - self.mpc.horizon
-        more = self.xp.broadcast_to(filler, (added, *found.shape[1:])).astype(found.dtype)
-        return self.xp.concatenate([found, more])
+        more = module_of(filler).broadcast_to(filler, (added, *found.shape[1:]))
+        return module_of(found, more).concatenate([found, more.astype(found.dtype)])
 
     def padded(self) -> MPC:
         """Return the problem of the longer horizon."""
@@ -131,7 +136,7 @@ class _Padding:
         if isinstance(limit, Box):
             changes["input_rate_limit"] = self.spread(limit, steps, longer)
         elif limit is not None:
-            limit = self.xp.broadcast_to(limit, (m,)) if dimensions(limit) == 0 else limit
+            limit = module_of(limit).broadcast_to(limit, (m,)) if dimensions(limit) == 0 else limit
             changes["input_rate_limit"] = self.longer(limit, 1, np.inf)
         changes["outputs"] = tuple(
             self.rows(rows, output_stages(mpc, rows))
@@ -145,14 +150,15 @@ class _Padding:
     def effort(self) -> Any:
         """Return R of the steps that are added, of the size of the others."""
         R = self.each(self.mpc.R, 2, 1)
-        size = self.xp.mean(self.xp.trace(R, axis1=1, axis2=2)) / R.shape[-1]
-        return self.xp.where(size > 0, size, 1.0) * np.eye(R.shape[-1])
+        xp = module_of(R)
+        size = xp.mean(xp.trace(R, axis1=1, axis2=2)) / R.shape[-1]
+        return xp.where(size > 0, size, 1.0) * np.eye(R.shape[-1])
 
     def gain(self) -> Any:
         """Return the prestabilising gain of each step, zero where it is added."""
         mpc = self.mpc
         if mpc.control_horizon is not None or not (
-            concrete(mpc) or not isinstance(mpc.prestabilise, Switch | None)
+            concrete(mpc.system.A, mpc.system.B) or not isinstance(mpc.prestabilise, Switch | None)
         ):
             return mpc.prestabilise
         return self.longer(prestabilising_gain(mpc), 2, 0.0)
@@ -180,6 +186,6 @@ class _Padding:
         changes: dict[str, Any] = {}
         for name in {*differing(part), *(k for k in ends if getattr(part, k, None) is not None)}:
             value = self.each(getattr(part, name), AXES[name], len(stages))
-            free = self.xp.full((1, *value.shape[1:]), ends.get(name, 0.0), value.dtype)
-            changes[name] = self.xp.concatenate([value, free])[at]
+            free = np.full((1, *value.shape[1:]), ends.get(name, 0.0), value.dtype)
+            changes[name] = module_of(value).concatenate([value, free])[at]
         return replace(part, **changes)

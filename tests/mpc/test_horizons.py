@@ -144,3 +144,24 @@ def test_steps_that_wait_are_no_padding():
     push = np.array([0.03, -0.02])
     plans = [jm.solve(mpc, [0.5, 0.1], forecast=w) for w in (push, np.tile(push, (4, 1)))]
     np.testing.assert_allclose(plans[0].states, plans[1].states, atol=1e-9)
+
+
+def test_padding_keeps_the_gain_of_known_dynamics_where_weights_are_traced():
+    mpc = jm.MPC(
+        jm.LinearSystem([[1.6, 0.3], [0.0, 1.4]], [[0.1], [0.5]]), np.eye(2), np.eye(1), 6,
+        jm.Box([-1, -1], [1, 1]), jm.Box([-1], [1]),
+    )  # fmt: skip
+    known = []
+
+    def padded(Q):
+        found = pad_horizon(replace(mpc, Q=Q), 9)
+        known.append((found.system.A, found.prestabilise))
+        return found
+
+    wanted, found = padded(mpc.Q), jax.jit(padded)(mpc.Q)
+    for name in ("Q", "R"):
+        np.testing.assert_allclose(getattr(found, name), getattr(wanted, name))
+    (A, K), (traced_A, traced_K) = known
+    np.testing.assert_array_equal(traced_A, A)
+    np.testing.assert_array_equal(traced_K, K)
+    assert np.any(K)
