@@ -279,10 +279,18 @@ def parse_options(kind: Any, prog: str, words: Sequence[str]) -> tuple[Everywher
     """
     both = with_common(kind)
     known = {f"--{field.name.replace('_', '-')}": field.name for field in fields(both)}
-    for before, word in zip((prog, *words), words, strict=False):
-        option, equals, value = word.partition("=")
-        if not word or (option in known and equals and not value):
-            fail(option or before, "is empty", "Give a value, or leave it out")
+    hints = get_type_hints(both)
+
+    def refuse(option: str, given: str) -> None:
+        wanted = f"Give {described_type(hints[known[option]])}"
+        fail(option, given, f"{wanted}; see {prog} --help")
+
+    for place, word in enumerate(words):
+        if word == "" or word.removesuffix("=") in known and word.endswith("="):
+            before = (w.partition("=")[0] for w in reversed(words[: place + 1]))
+            option = next((name for name in before if name in known), None)
+            if option is not None:
+                refuse(option, "no value")
     text = io.StringIO()
     try:
         with contextlib.redirect_stderr(text):
@@ -302,8 +310,7 @@ def parse_options(kind: Any, prog: str, words: Sequence[str]) -> tuple[Everywher
             fail(prog, f"no {needed} given", f"Name it after the command; see {prog} --help")
         if name is None:
             fail(prog, " ".join(re.sub(r"[^ -~]", " ", text.getvalue()).split()), "")
-        wanted = f"Give {described_type(get_type_hints(both)[known[name]])}"
-        fail(name, values_of(name, words), f"{wanted}; see {prog} --help")
+        refuse(name, values_of(name, words))
     if rest:
         what = "no such option" if rest[0].startswith("-") else "belongs to no option"
         switches = [f"--no-{field.name}" for field in fields(kind) if field.default is True]

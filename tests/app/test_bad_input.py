@@ -353,7 +353,7 @@ LINES = [
     ("sweep --config", "--config: no value. Give a path"),
     ("sweep --config absent.toml", "absent.toml: cannot be read"),
     ("sweep --config .", "cannot be read"),
-    ("sweep --config ''", "cannot be read"),
+    ("sweep --config ''", "--config: no value. Give a path"),
     ("sweep --output file/below", "--output file/below"),
     ("sweep --output file", "--output file"),
     ("sweep --output /proc/none", "--output /proc/none"),

@@ -189,9 +189,9 @@ def test_ctrl_c_keeps_blocks_and_says_how_to_resume(tmp_path, monkeypatch, capsy
         ("--axes q --grid 5", "sweep.fixed: 2 states, 1 mapped"),
         ("--config absent.toml", "absent.toml: cannot be read"),
         ("--output file/below", "file/below: Not a directory"),
-        ("--output ''", "--output: is empty"),
-        ("--output=", "--output: is empty"),
-        ("--grid 5 5 ''", "5: is empty"),
+        ("--output ''", "--output: no value. Give a path"),
+        ("--output=", "--output: no value. Give a path"),
+        ("--grid 5 5 ''", "--grid: no value. Give whole numbers"),
         ("--resume --overwrite", "Choose one"),
     ],
 )
