@@ -280,12 +280,13 @@ def harmless(mpc: MPC) -> tuple[MPC, Any]:
     known dynamics there are gains and sets that traced ones have not."""
     fields = ("system", "Q", "R", "terminal_cost", "stage_weights", "input_rate_weight")
     data = {name: getattr(mpc, name) for name in fields}
-    instead = {**jax.tree.map(lambda _: 0.0, data), "R": np.eye(mpc.system.m)}
     leaves, tree = jax.tree.flatten(data)
     traced = [i for i, leaf in enumerate(leaves) if not concrete(leaf)]
     if not traced:
         return mpc, True
-    values = [(leaves[i], jax.tree.leaves(instead)[i]) for i in traced]
+    zeros = jax.tree.map(lambda _: 0.0, data)
+    instead = jax.tree.leaves({**zeros, "R": np.eye(mpc.system.m)})
+    values = [(leaves[i], instead[i]) for i in traced]
     clean, finite = _harmless(values)
     for i, leaf in zip(traced, clean, strict=True):
         leaves[i] = leaf

@@ -114,10 +114,8 @@ def require_disturbance(argument: str, W: Any, dimension: int) -> None:
     require_kind(argument, W, Box, Polytope, Zonotope, Vertices, Image, cure=cure)
     if concrete(W) and any(np.isnan(values).any() for values in jax.tree.leaves(W)):
         fail(argument, "holds NaN", "Give a bounded set")
-    if W.dimension not in (
-        dimension,
-        1 if isinstance(W, Box) and not dimensions(W.lower) else None,
-    ):
+    same_for_all = isinstance(W, Box) and not dimensions(W.lower)
+    if W.dimension != dimension and not same_for_all:
         what = f"has dimension {W.dimension} where {dimension} is needed"
         fail(argument, what, "Give one w for each state, or x+ = ... + E w as disturbance_matrix=E")
     W.validate(argument, dimension)
