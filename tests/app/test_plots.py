@@ -303,7 +303,8 @@ def test_robot_map_says_in_words_what_became_of_each_state(claim):
         seconds=2.0,
         robot=SimpleNamespace(name="pendulum", dt=0.02, time_unit="s"),
     )
-    ax = plot_robot_map(rmap)
+    ax = Figure().add_subplot()
+    assert plot_robot_map(rmap, ax) is ax
     counts = {
         text.rsplit(" (", 1)[0].replace("\n", " "): int(text.rsplit(" (", 1)[1][:-1])
         for text in texts(ax)
@@ -432,7 +433,12 @@ def test_no_panel_of_loops_that_end_is_empty(finite):
     )
     run = Run(states, inputs, zeros, zeros, zeros, zeros, zeros, zeros)
     require_no_empty_panel(plot_runs(run, plant))
-    require_no_empty_panel(plot_before_after(run, run, plant))
+    figure = plot_before_after(run, run, plant, loops=[2, 0])
+    require_no_empty_panel(figure)
+    shown = [line for line in figure.axes[0].lines if len(line.get_xdata()) == T + 1]
+    assert len(shown) == 4  # two loops, before and after
+    with pytest.raises(ValueError, match="loops: "):
+        plot_before_after(run, run, plant, loops=[B])
 
 
 def test_an_empty_panel_is_found():
@@ -451,7 +457,9 @@ def test_an_empty_panel_is_found():
 def test_a_trade_off_shows_the_front_dominated_points_and_the_start():
     losses = np.array([[3.0, 1.0], [1.0, 4.0], [2.5, 3.0], [2.0, 2.0]])
     weights = np.array([[1.0, 20.0], [5.0, 2.0], [1.0, 0.0], [1.0, 2.0]])
-    ax = plot_trade_off(TradeOff(("far", "loud"), weights, losses, np.array([4.0, 2.0]), ()))
+    ax = Figure().add_subplot()
+    trade = TradeOff(("far", "loud"), weights, losses, np.array([4.0, 2.0]), ())
+    assert plot_trade_off(trade, ax) is ax
     lines = {line.get_label(): line.get_xydata().tolist() for line in ax.lines}
     assert lines["Pareto optimal"] == [[1.0, 4.0], [2.0, 2.0], [3.0, 1.0]]
     assert lines["dominated"] == [[2.5, 3.0]] and lines["as given"] == [[4.0, 2.0]]
@@ -475,8 +483,11 @@ def test_a_plan_over_its_horizon():
     # Without Newton steps a program compiles fastest; what is drawn is replaced.
     plan = jm.solve(mpc, x[0], solver=jm.ADMM(20, newton_steps=0))
     plan = dataclasses.replace(plan, states=x, inputs=u, status=np.int32(jm.Status.SOLVED))
-    figure = plot_plan(plan, mpc, reference=[0.2, 0])
+    drawn = {"reference": [0.2, 0], "input_reference": [0.7], "title": "A plan"}
+    figure = plot_plan(plan, mpc, **drawn)
     q, dq, torque = figure.axes
+    assert figure.get_suptitle() == "A plan"
+    assert any(np.all(line.get_ydata() == 0.7) for line in torque.lines)
     np.testing.assert_allclose(q.lines[0].get_ydata(), x[:, 0])
     np.testing.assert_allclose(torque.lines[0].get_ydata(), [1, 2, 2.5, 2.5])
     # Grey regions, and their edges: below, above.

@@ -52,6 +52,9 @@ def test_starts_may_be_lists_and_a_loop_that_overflows_has_no_distance():
     first = draw_disturbances(mpc, 4, 1, seed=1)[0]
     assert np.isnan(beyond)
     np.testing.assert_array_equal(sequence, first)  # the one that did that, and none after it
+    drawn, of_drawn = worst_disturbance(law, [0.5, 0.0], 4, rounds=1, seed=1)
+    np.testing.assert_array_equal(drawn, first)  # no step by the gradient
+    assert of_drawn <= as_array
 
 
 @pytest.mark.slow

@@ -50,6 +50,17 @@ def test_its_feasible_set_is_the_set():
     assert found.is_subset(jm.Polytope(C.H, C.h), 1e-8) and C.is_subset(found, 1e-8)
 
 
+def test_a_disturbance_through_a_matrix_is_its_image():
+    """One w moves both states: the rows are those of the segment E W, and of no other set."""
+    E, C = np.array([[0.1], [-0.2]]), jm.Box([-1.0, -1.0], [1.0, 1.0])
+    through = first_step_in(NOMINAL, C, disturbance=jm.Box([-1.0], [1.0]), disturbance_matrix=E)
+    image = first_step_in(NOMINAL, C, disturbance=jm.sets.Zonotope(np.zeros(2), E))
+    for one, other in zip(through.outputs, image.outputs, strict=True):
+        np.testing.assert_allclose(one.upper, other.upper, rtol=1e-14)
+        np.testing.assert_allclose(one.C, other.C)
+    np.testing.assert_allclose(np.sort(through.outputs[-1].upper), [0.8, 0.8, 0.9, 0.9])
+
+
 @pytest.mark.slow
 def test_closed_loops_stay_for_every_plant_and_disturbance():
     C = maximal_control_invariant_set(VERTICES, X, U, disturbance=W)

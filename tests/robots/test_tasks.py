@@ -116,18 +116,22 @@ class TestFunctions:
         between = lambda a, b: lambda m, d: mujoco.mj_geomDistance(m, d, geom(a), geom(b), 9, None)
         quaternion = np.array([0.5, -0.5, 0.5, 0.5])
 
-        def turned(m, d):
+        def turned(R):
             found, vector = np.zeros(4), np.zeros(3)
-            mujoco.mju_mat2Quat(found, d.site_xmat[0])
+            mujoco.mju_mat2Quat(found, np.ravel(R))
             mujoco.mju_mulQuat(found, found.copy(), quaternion * [1, -1, -1, -1])
             mujoco.mju_quat2Vel(vector, found, 1)
             return vector
+
+        turn = lambda name, kind: tasks.orientation(two, name, quaternion, kind)
 
         return {
             "tip": (tasks.position(two, "tip"), lambda m, d: d.site_xpos[0]),
             "hand": (tasks.position(two, "hand", "body"), lambda m, d: d.body("hand").xpos),
             "geom": (tasks.position(two, "left", "geom"), lambda m, d: d.geom("left").xpos),
-            "turn": (tasks.orientation(two, "tip", quaternion), turned),
+            "turn": (turn("tip", "site"), lambda m, d: turned(d.site("tip").xmat)),
+            "turn of a body": (turn("hand", "body"), lambda m, d: turned(d.body("hand").xmat)),
+            "turn of a geom": (turn("left", "geom"), lambda m, d: turned(d.geom("left").xmat)),
             "arms": (tasks.distance(two, "hand", "right"), between("hand", "right")),
             "own ball": (tasks.distance(two, "left", "ball"), between("left", "ball")),
             "ball": (tasks.distance(two, "hand", ([0.5, 0.1, 0.3], 0.07)), between("hand", "ball")),
