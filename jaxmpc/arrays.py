@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from fractions import Fraction
 from numbers import Real
+from types import ModuleType
 from typing import TYPE_CHECKING, Any, NewType, TypeAlias
 
 import jax
@@ -137,6 +138,11 @@ def _array(value: Reals) -> jax.Array | np.ndarray:
 def as_array(value: Any) -> Any:
     """Return `value`, made an array if it is nested lists of traced numbers (lists under `jit`)."""
     return value if concrete(value) else jnp.asarray(value)
+
+
+def module_of(*values: Any) -> ModuleType:
+    """Return NumPy where none of the values is being traced, else `jax.numpy`."""
+    return np if concrete(*values) else jnp
 
 
 def as_floats(value: Any) -> Any:

@@ -12,7 +12,7 @@ import numpy as np
 import scipy
 from jax import Array
 
-from jaxmpc.arrays import as_floats, dimensions
+from jaxmpc.arrays import as_floats, dimensions, module_of
 from jaxmpc.checks import (
     concrete,
     fail,
@@ -113,12 +113,12 @@ def whole_array(value: Any) -> Any:
     """Return lists as one array, so that a pytree has one leaf for them; None as it is."""
     if value is None:
         return None
-    return np.asarray(value) if concrete(value) else jnp.asarray(value)
+    return module_of(value).asarray(value)
 
 
 def covariance(spread: Any, size: int) -> Any:
     """Return the covariance (size, size) of standard deviations, or the covariance that it is."""
-    xp = np if concrete(spread) else jnp
+    xp = module_of(spread)
     spread = xp.asarray(spread)
     if spread.ndim == 2:
         return symmetric(spread)
@@ -369,7 +369,7 @@ class KalmanFilter:
         rows = self._rows(kind)
         sizes = [(one, np.shape(one.matrix)[1]) for one in self._each]
         parts = [one.matrix if one.kind == kind else np.zeros((rows, k)) for one, k in sizes]
-        return (np if concrete(parts) else jnp).concatenate([np.zeros((rows, 0)), *parts], axis=1)
+        return module_of(parts).concatenate([np.zeros((rows, 0)), *parts], axis=1)
 
     def on_states(self, B: Any) -> Any:
         """Return what the disturbances add to the next state, B M_input + M_state (n, k)."""
@@ -515,13 +515,13 @@ class KalmanFilter:
         """Return (C, C_d) (p, n + k), the outputs of states and disturbances."""
         C = np.eye(self.p, self.model.n) if self.C is None else self.C
         parts = [C, self.matrix("output")]
-        return (np if concrete(parts) else jnp).concatenate(parts, axis=1)
+        return module_of(parts).concatenate(parts, axis=1)
 
     def _with_disturbances(self, A: Any, B: Any) -> tuple[Any, Any]:
         """Return the matrices of the model of states and disturbances (n + k): of these themselves,
         and of the inputs."""
         k = self.disturbances
-        xp = np if concrete(A, B, self.disturbance) else jnp
+        xp = module_of(A, B, self.disturbance)
         A, B = xp.asarray(A), xp.asarray(B)
         zeros = lambda *shape: xp.zeros(shape, A.dtype)
         top = xp.concatenate([A, xp.asarray(self.on_states(B), A.dtype)], axis=1)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxmpc.arrays import Reals, host_array
+from jaxmpc.arrays import Reals, host_array, module_of
 from jaxmpc.checks import concrete, fail, require_finite, require_kind, require_shape
 from jaxmpc.closed_loop.estimation import KalmanFilter
 from jaxmpc.closed_loop.robot_controller import RobotController
@@ -248,7 +248,7 @@ def augmented(mpc: MPC, observer: KalmanFilter) -> MPC:
         state_units=units,
     )
     wider = partial(_with_columns, k=k)
-    weight = lambda M: np.pad(np.asarray(M), (0, k)) if concrete(M) else jnp.pad(M, (0, k))
+    weight = lambda M: module_of(M).pad(M, (0, k))
     return replace(
         mpc,
         system=more,

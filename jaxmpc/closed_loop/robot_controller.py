@@ -7,12 +7,11 @@ from dataclasses import field, replace
 from typing import Any, Literal
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxmpc.arrays import Reals, as_array, as_weight
-from jaxmpc.checks import concrete, fail, number, require_kind, whole
+from jaxmpc.arrays import Reals, as_array, as_weight, module_of
+from jaxmpc.checks import fail, number, require_kind, whole
 from jaxmpc.closed_loop.feedback import one_state
 from jaxmpc.closed_loop.nonlinear_controller import (
     at_rest,
@@ -464,7 +463,7 @@ def softened_limits(mpc: MPC, rho: Reals) -> MPC:
     outputs = as_tuple("outputs", mpc.outputs, Outputs)
     others = tuple(rows for rows in outputs if not isinstance(rows, ForceLimits))
     soft = soften(replace(mpc, outputs=others), rho)
-    heavy, xp = [], np if concrete(rho) else jnp
+    heavy, xp = [], module_of(rho)
     for rows in outputs:
         if isinstance(rows, ForceLimits):
             of_inputs, of_states = (

@@ -11,14 +11,12 @@ those of the last block, and cost nothing.) A constant forecast is one of the fi
 
 from collections.abc import Sequence
 from dataclasses import replace
-from types import ModuleType
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from jaxmpc.arrays import dimensions
+from jaxmpc.arrays import dimensions, module_of
 from jaxmpc.checks import concrete, fail, require_kind, whole
 from jaxmpc.mpc.condense import prestabilising_gain
 from jaxmpc.mpc.problem import (
@@ -75,13 +73,8 @@ def stack_horizons(problems: Sequence[MPC]) -> MPC:
         if form(mpc) != form(padded[0]):
             what = "has other sizes, limits or settings than problems[0]"
             fail(f"problems[{i}]", what, "Stack problems that differ in numbers and horizon alone")
-    stack = jnp.stack if not concrete(padded) else np.stack
-    return jax.tree.map(lambda *v: stack(v), *padded)
-
-
-def module_of(*values: Any) -> ModuleType:
-    """Return NumPy where none of the values is being traced, else `jax.numpy`."""
-    return np if concrete(*values) else jnp
+    xp = module_of(padded)
+    return jax.tree.map(lambda *v: xp.stack(v), *padded)
 
 
 class _Padding:

@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxmpc.arrays import Reals, as_array, host_array
-from jaxmpc.checks import concrete, fail, require_finite, require_kind, require_shape
+from jaxmpc.arrays import Reals, as_array, host_array, module_of
+from jaxmpc.checks import fail, require_finite, require_kind, require_shape
 from jaxmpc.mpc.problem import MPC, at_stage, weights_of
 from jaxmpc.mpc.rows import Block, Layout, blocks, given_blocks, layout, row_count, row_table, split
 from jaxmpc.pytrees import named_pytree, pytree
@@ -94,7 +94,7 @@ def _where_steps_do_something(mpc: MPC, forecast: Any) -> Any:
     A, B, Q = (as_array(v) for v in (mpc.system.A, mpc.system.B, mpc.Q))
     if forecast is None or np.ndim(forecast) > 1 or min(v.ndim for v in (A, B, Q)) < 3:
         return forecast
-    xp = np if concrete(A, B, Q, forecast) else jnp
+    xp = module_of(A, B, Q, forecast)
     still = xp.all(A == xp.eye(A.shape[-1], dtype=A.dtype), axis=(1, 2))
     idle = still & ~xp.any(B, axis=(1, 2)) & ~xp.any(Q, axis=(1, 2))
     idle = xp.cumsum(~idle[::-1])[::-1] == 0  # to the end

@@ -21,10 +21,9 @@ middle of the period would leave out the largest forces that the plant has.
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from jaxmpc.checks import concrete
+from jaxmpc.arrays import module_of
 from jaxmpc.mpc.problem import Outputs
 from jaxmpc.pytrees import pytree
 from jaxmpc.robots.description import RobotDescription, host_coordinates
@@ -136,7 +135,7 @@ def stopping_limits(robot: RobotDescription, q: Any, positions: Box) -> Stopping
         share = model.tendon_actfrcrange[tendon] / pulls.sum()
         ends[pulls, 0] = np.maximum(ends[pulls, 0], share[0])
         ends[pulls, 1] = np.minimum(ends[pulls, 1], share[1])
-    xp = np if concrete(positions) else jnp
+    xp = module_of(positions)
     lower, upper = (xp.asarray(side) for side in (positions.lower, positions.upper))
     bounded = np.isfinite(np.subtract(*robot.state_limits.bounds()))
     # Chords of v = √(2 a d) between distances d = D w, w the width of the range: √(w/a) v = √(2 D),
