@@ -53,7 +53,7 @@ def mpc(joint):
 
 @pytest.fixture(autouse=True)
 def _prepared(in_empty_folder, monkeypatch, joint):
-    given = lambda name: joint if name == "joint" else jm.load_robot(name)
+    given = lambda name: joint if name.endswith("joint") else jm.load_robot(name)
     monkeypatch.setattr(simulate, "load_robot", given)
 
 
@@ -141,6 +141,8 @@ def test_interrupted_resumed_and_judged(tmp_path, monkeypatch, capsys, mpc):
 
     again = run(f"{LINE} --output 'my runs' --resume --video 0")  # nothing is left to do
     assert again == 0 and len(asked) == 3 and "run" not in rows(capsys.readouterr().out)
+    same = LINE.replace("--robot joint", "--robot ./joint")  # the same model, asked for otherwise
+    assert run(f"{same} --output 'my runs' --resume --video 0") == 0 and len(asked) == 3
     assert run(f"{LINE} --output 'my runs'") == 2
     assert "--overwrite" in capsys.readouterr().err
 

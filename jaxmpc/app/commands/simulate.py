@@ -178,7 +178,8 @@ class Simulate(SimulateOptions):
             del options["config"]
         else:  # what is in the file, not where it lies
             options |= {"config": "tuned", "Q": mpc.Q, "R": mpc.R, "P": mpc.terminal_cost}
-        return as_json(options | {"model": model_hash(robot)})
+        # The model itself, not where its file lies.
+        return as_json(options | {"robot": robot.name, "model": model_hash(robot)})
 
     def settled(self) -> "Simulate":
         """Return the command with the values of --config or `USUAL` for options not given."""
