@@ -26,7 +26,7 @@ MOST_COUNT = 2**31 - 1
 
 def fail(argument: str, problem: str, cure: str) -> NoReturn:
     """Raise a ValueError that names the argument, what is wrong, and what to do."""
-    problem = re.sub(r"\bis a (?=[aeioAEIO]|MPC\b|LQR\b|Mj)", "is an ", problem)
+    problem = re.sub(r"\bis a (?=[aeioAEIO]|nd|MPC\b|LQR\b|Mj)", "is an ", problem)
     raise ValueError(printable(f"{argument}: {problem}. {cure}"))
 
 

@@ -114,11 +114,11 @@ CALLS = [
     ("reference: 'r' where real numbers are", lambda: jm.solve(M, x, "r")),
     ("reference: entries of type complex128 where", lambda: jm.solve(M, x, x + 1j)),
     ("reference: shape (3,). Give (2,) or (4, 2)", lambda: jm.solve(M, x, np.zeros(3))),
-    ("solver: is a ndarray. Give a jm.ADMM", lambda: jm.solve(M, x, None, x)),
+    ("solver: is an ndarray. Give a jm.ADMM", lambda: jm.solve(M, x, None, x)),
     ("solver: is a str. Give a jm.ADMM", lambda: jm.solve(M, x, solver="osqp")),
     ("solver: is a type. Give a jm.ADMM", lambda: jm.solve(M, x, solver=jm.ADMM)),
     ("warm_start: is a str. Give a Plan or a", lambda: jm.solve(M, x, warm_start="x")),
-    ("warm_start: is a ndarray. Give a Plan or a", lambda: jm.solve(M, x, warm_start=x)),
+    ("warm_start: is an ndarray. Give a Plan or a", lambda: jm.solve(M, x, warm_start=x)),
     (
         "input_reference: shape (2,). Give (1,) or (3, 1)",
         lambda: jm.solve(M, x, input_reference=np.zeros(2)),
@@ -246,7 +246,7 @@ CALLS = [
         lambda: jm.solve(M, x, solver=jm.ADMM(smoothing="s")),
     ),
     ("system: is an int. Give a jm.LinearSystem", lambda: mpc(system=3).validate()),
-    ("system: is a ndarray. Give a", lambda: mpc(system=A).validate()),
+    ("system: is an ndarray. Give a", lambda: mpc(system=A).validate()),
     ("Q: 'Q' where real numbers are", lambda: mpc(Q="Q").validate()),
     ("Q: entries of type <U1 where real", lambda: mpc(Q=[["a", "b"], ["c", "d"]]).validate()),
     ("Q: None where real numbers are", lambda: mpc(Q=None).validate()),
@@ -268,6 +268,7 @@ CALLS = [
     ("horizon: '3'. Give a whole number of", lambda: mpc(horizon="3")),
     ("horizon: None. Give a whole number of", lambda: mpc(horizon=None)),
     ("horizon: [3]. Give a whole number of", lambda: mpc(horizon=[3])),
+    ("system: is an ndarray. Give a jm.LinearSystem", lambda: jm.MPC(A, B, A, [[1]], 10)),
     ("horizon: needs ", lambda: jm.solve(mpc(horizon=10**6), x)),
     ("horizon: needs ", lambda: jm.solve(mpc(horizon=10**30), x)),
     ("horizon: needs ", lambda: jm.map_feasible_set(mpc(horizon=10**6), np.zeros((1, 2)))),
@@ -831,7 +832,7 @@ def test_wrong_arguments_of_a_controller_are_named():
             controller(given)
         assert str(caught.value).startswith(message)
     for feedback in (controller, jm.closed_loop.LinearFeedback(M, np.zeros((1, 2)))):
-        with pytest.raises(ValueError, match="^before: is a ndarray. .* reference has its name"):
+        with pytest.raises(ValueError, match="^before: is an ndarray. .* reference has its name"):
             feedback(x, np.zeros(2))
     for wrong in ("x", x + 1j, np.zeros(3)):
         with pytest.raises(ValueError, match="^x0: "):

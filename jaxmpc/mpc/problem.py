@@ -286,6 +286,7 @@ class MPC:
             )
             fail("horizon", "is traced by JAX", cure)
         if not isinstance(N, int | np.integer) or isinstance(N, bool) or N < 1:
+            require_kind("system", self.system, LinearSystem)  # MPC(A, B, Q, R, 10)
             fail("horizon", f"{N!r}", "Give a whole number of steps, at least 1")
         weights = ("Q", "R", "terminal_cost", "input_rate_weight", "stage_weights")
         store_floats(self, *weights, "prestabilise", "input_rate_limit")

@@ -439,7 +439,7 @@ def test_film_refuses_what_it_cannot_draw(tmp_path, monkeypatch, joint):
             save_video(tmp_path / name, given, 25)
     with pytest.raises(ValueError, match="fps: 0"):
         Film(frames, 0)
-    with pytest.raises(ValueError, match="path: is a ndarray. Give the path first"):
+    with pytest.raises(ValueError, match="path: is an ndarray. Give the path first"):
         save_video(frames, "a.gif", 25)
     monkeypatch.setitem(sys.modules, "imageio", None)
     monkeypatch.setitem(sys.modules, "imageio.v3", None)
