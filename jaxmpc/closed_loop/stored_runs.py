@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from functools import partial
 from pathlib import Path
-from types import CodeType, FunctionType, MethodType
+from types import CodeType, FunctionType, MethodType, ModuleType
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -20,14 +20,15 @@ from jaxmpc.files import check_results, fingerprint
 from jaxmpc.pytrees import record
 from jaxmpc.qp.status import Status
 from jaxmpc.robots.load import model_hash
+from jaxmpc.robots.mujoco_access import model_bytes
 from jaxmpc.robots.parameters import require_numbers
 from jaxmpc.robots.robot import Robot
 
 if TYPE_CHECKING:
     from jaxmpc.store import BlockWriter, Field, Store
 
-# The fields of `Run` in a store. Stored runs have no observer, hence no estimates, and no soft rows
-# at k = 0: x_0 is measured, and no limit binds it.
+# The fields of `Run` in a store: without an observer there are no estimates, and violations of soft
+# rows at k = 0 are not kept.
 STORED = tuple(
     field.name for field in fields(Run) if field.name not in ("slack", "estimates", "disturbances")
 )
@@ -72,8 +73,9 @@ def simulate_into(
         `simulate_many`. Runs are in the precision of the controller.
     factors: by which the plants differ from the robot, of `draw_factors`.
     settings: JSON data that determine the runs: a store with others is refused. None: hashes of
-        controller, model, references and factors. Of functions, such as those of tasks, it is their
-        own code and what they close over: functions that they call are taken to be as before.
+        controller, models, references and factors. Of functions, such as those of tasks, it is
+        their own code, and the data that they close over or read from their module: functions that
+        they call are taken to be as before.
     chunk: robots of a block, which run at once, and are written at once while the next ones run: a
         killed run loses the block that runs and those being written (`store.BlockWriter`).
     resume: go on with the runs at `path`. overwrite: put new ones in their place, once their first
@@ -129,8 +131,7 @@ class _Loops:
     def settings(self) -> dict[str, Any]:
         """Return what determines the runs, as hashes."""
         aims = (self.target["reference"], self.target["input_reference"])
-        data = jax.tree.leaves((self.controller, aims, self.factors))
-        data_hash = fingerprint(plain_data(self.controller), data)
+        data_hash = fingerprint(plain_data((self.controller, aims, self.factors)))
         robot = self.robot
         plant = fingerprint(
             repr(sorted(robot.numbers)), [robot.dt, *jax.tree.leaves(robot.numbers)]
@@ -180,31 +181,41 @@ class _Loops:
         writer.put(part.place, rows, **runs, **own)
 
 
-def plain_data(value: Any) -> Any:
-    """Return what is no array in a dataclass as JSON data: numbers, texts, what functions do, and
-    names of other types."""
+def plain_data(value: Any, within: tuple[int, ...] = ()) -> Any:
+    """Return what a value is as JSON data: hashes of its arrays and of MuJoCo's models, what its
+    functions do, and the same of all that it holds; of other types that hold nothing their names.
+
+    within: the `id` of what holds it, for what holds itself.
+    """
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if isinstance(value, np.ndarray | np.generic | jax.Array):
+        return fingerprint(None, value)
+    if id(value) in within:
+        return "itself"
+    parts = lambda held: plain_data(held, (*within, id(value)))
     if is_dataclass(value) and not isinstance(value, type):
-        return {field.name: plain_data(getattr(value, field.name)) for field in fields(value)}
-    if isinstance(value, tuple):
-        return [plain_data(part) for part in value]
+        return {field.name: parts(getattr(value, field.name)) for field in fields(value)}
+    if isinstance(value, tuple | list):
+        return list(map(parts, value))
+    if isinstance(value, Mapping):
+        return {str(key): parts(held) for key, held in value.items()}
     if isinstance(value, partial):
-        return [plain_data(value.func), _held(value.args, *sorted(value.keywords.items()))]
+        return list(map(parts, (value.func, value.args, value.keywords)))
     if isinstance(function := inspect.unwrap(value) if callable(value) else value, MethodType):
-        return [plain_data(function.__func__), _held(function.__self__)]
+        return list(map(parts, (function.__func__, function.__self__)))
     if isinstance(function, FunctionType):
+        code = function.__code__
         closed_over = [cell.cell_contents for cell in function.__closure__ or ()]
-        held = _held(closed_over, function.__defaults__, function.__kwdefaults__)
-        return [_plain_code(function.__code__), held]
-    plain = value is None or isinstance(value, bool | int | float | str)
-    return value if plain else type(value).__name__
-
-
-def _held(*values: Any) -> list[Any]:
-    """Return what a function has beside its code as JSON data: the hash of arrays, and the rest."""
-    held = jax.tree.leaves(values)
-    arrays = [v for v in held if isinstance(v, np.ndarray | np.generic | jax.Array)]
-    others = [v for v in held if not isinstance(v, np.ndarray | np.generic | jax.Array)]
-    return [*map(plain_data, others), fingerprint(None, arrays)]
+        held = closed_over, function.__defaults__, function.__kwdefaults__
+        return [_plain_code(code), *map(parts, (*held, _read(code, function.__globals__)))]
+    if isinstance(value, type | ModuleType):
+        return value.__name__
+    if type(value).__name__ == "MjModel":
+        return fingerprint(None, model_bytes(value))
+    given = lambda key: key[:1] != "_" and not hasattr(type(value), key)  # no cached property
+    own = {key: held for key, held in getattr(value, "__dict__", {}).items() if given(key)}
+    return [type(value).__name__, parts(own)]
 
 
 def _plain_code(code: CodeType) -> list[Any]:
@@ -212,3 +223,12 @@ def _plain_code(code: CodeType) -> list[Any]:
     ordered = lambda v: sorted(map(repr, v)) if isinstance(v, frozenset) else repr(v)
     constants = [_plain_code(v) if isinstance(v, CodeType) else ordered(v) for v in code.co_consts]
     return [code.co_code.hex(), list(code.co_names), constants]
+
+
+def _read(code: CodeType, names: Mapping[str, Any]) -> dict[str, Any]:
+    """Return those of the module's names that a function reads, but for modules, types and
+    functions."""
+    inner = [_read(v, names) for v in code.co_consts if isinstance(v, CodeType)]
+    own = {key: names[key] for key in code.co_names if key in names}
+    found = {k: v for k, v in own.items() if not (callable(v) or isinstance(v, ModuleType))}
+    return found | {key: v for part in inner for key, v in part.items()}

@@ -1,5 +1,7 @@
 """Robot runs in a store, from Python: what the command `jaxmpc simulate` calls."""
 
+import copy
+import dataclasses
 import json
 from functools import partial
 
@@ -20,6 +22,7 @@ from jaxmpc.closed_loop import (
 from jaxmpc.closed_loop.stored_runs import plain_data
 from jaxmpc.closed_loop.variations import plant_numbers
 from jaxmpc.mpc import Task
+from jaxmpc.robots.physics import Physics
 
 STEPS = 400
 
@@ -93,10 +96,24 @@ def test_functions_are_told_apart_by_what_they_do(joint, feedback):
         return lambda d: scale * held[i] * d.site_xpos[0, i : i + 1]
 
     class Tilted:
-        def value(self, d):
-            return d.xpos[0]
+        def __init__(self, by):
+            self.by, self._cache = by, object()
 
-    alike = [lambda: measured(0), lambda: partial(measured(0), 1.0), lambda: jax.jit(measured(0))]
+        def value(self, d):
+            return self.by * d.xpos[0]
+
+    def of_module(aim):
+        """A function of a script in which AIM is this."""
+        exec("def value(d):\n    return (lambda v: v - AIM)(d.xpos[0])", names := {"AIM": aim})
+        return names["value"]
+
+    def again(n):
+        return again(n - 1) if n else 0.0
+
+    alike = [
+        lambda: measured(0), lambda: partial(measured(0), 1.0), lambda: jax.jit(measured(0)),
+        lambda: Tilted(1.0).value, lambda: of_module(1.0), lambda: again, lambda: {"k": joint},
+    ]  # fmt: skip
     for made in alike:
         assert plain_data(made()) == plain_data(made())
     others = [
@@ -105,10 +122,23 @@ def test_functions_are_told_apart_by_what_they_do(joint, feedback):
         partial(measured(0), np.ones(2)), partial(measured(0), np.zeros(2)),
         lambda d: d.xpos[0], lambda d: d.xpos[1], lambda d, k=2: d.xpos[k],
         lambda d, k=3: d.xpos[k], lambda d: d.site_xpos[0], lambda d: (lambda k: d.xpos[k])(1),
-        lambda d: (lambda k: d.xpos[k])(2), Tilted().value,
+        lambda d: (lambda k: d.xpos[k])(2), Tilted(1.0).value, Tilted(2.0).value,
+        of_module(1.0), of_module(2.0), of_module(np.ones(2)),
     ]  # fmt: skip
     seen = [json.dumps(plain_data(Task(function, weight=1.0))) for function in others]
     assert len(set(seen)) == len(seen)
+
+
+def test_models_are_told_apart_by_their_numbers(joint):
+    """Those that predict have the names that they had after an edit of their file."""
+    heavier = copy.copy(joint.mujoco)
+    heavier.body_mass[:] *= 2
+    mpc = jm.robot_mpc(joint, horizon=3)
+    one, other, same = (
+        plain_data(jm.RobotController(robot, mpc, linearize="trajectory"))
+        for robot in (joint, dataclasses.replace(joint, predictor=Physics(heavier)), joint)
+    )
+    assert one == same != other
 
 
 def test_summary_says_what_the_states_say(joint, feedback):
