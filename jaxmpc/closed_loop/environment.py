@@ -9,7 +9,7 @@ from jax import Array
 
 from jaxmpc.arrays import Reals, as_floats, as_weight
 from jaxmpc.checks import fail, number, require_kind, require_shape, require_symmetric_psd, whole
-from jaxmpc.closed_loop.feedback import Feedback, model_of
+from jaxmpc.closed_loop.feedback import Feedback, LinearFeedback, model_of
 from jaxmpc.closed_loop.orientations import error_of
 from jaxmpc.closed_loop.robot_controller import robot_mpc
 from jaxmpc.closed_loop.variations import free_motions, start_room
@@ -170,25 +170,31 @@ class MPCPolicy:
     """A controller as a policy: `policy(observation) -> action`, a pure function.
 
     controller: a Controller, RobotController or LinearFeedback. reference, input_reference: the
-    target, as in `simulate`. The observation (n,) is the coordinates ξ. Each call solves its plan
-    from a cold start; `controller(x, before)` is warm-started. Under `jax.jit`, `jax.vmap`, and
-    differentiable in the observation, the references and all that the controller is made of. A
-    pytree: `replace(policy, reference=...)` under `jax.vmap` gives each robot its own target.
+    target, as a plan takes it, the same at each call. The observation (n,) is the coordinates ξ.
+    Each call solves its plan from a cold start; `controller(x, before)` is warm-started. Under
+    `jax.jit`, `jax.vmap`, and differentiable in the observation, the references and all that the
+    controller is made of. A pytree: `replace(policy, reference=...)` under `jax.vmap` gives each
+    robot its own target.
     """
 
     controller: Feedback
     reference: Any = None
     input_reference: Any = None
 
-    def __call__(self, observation: Any) -> Array:
-        """Return the action (m,) for an observation (n,)."""
+    def __call__(self, observation: Any, previous_input: Any = None) -> Array:
+        """Return the action (m,) for an observation (n,). previous_input (m,): the action before,
+        which problems with limits or weights of input rates need."""
         if hasattr(self.controller, "motion"):
             what = f"is a {type(self.controller).__name__}, whose plans begin where the last ended"
             fail("controller", what, "Call controller(x, before) with what it returned before")
         n = self.controller.mpc.system.n
+        planned = not isinstance(self.controller, LinearFeedback)
+        if planned and self.controller.mpc.input_in_state and previous_input is None:
+            what = "is None, and the plan depends on it: rates of the inputs are limited or cost"
+            fail("previous_input", what, "Give the action before, at first what is applied now")
         require_shape("observation", observation, (n,), "The coordinates; use jax.vmap for many")
         xi = jnp.asarray(observation, self.controller.dtype)
         model = model_of(self.controller)
         x = model.state(xi) if hasattr(model, "state") else xi
         aims = {"reference": self.reference, "input_reference": self.input_reference}
-        return self.controller(x, **aims).u
+        return self.controller(x, **aims, previous_input=previous_input).u

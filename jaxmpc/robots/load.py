@@ -66,8 +66,8 @@ def load_robot(
         model: "joint" (one hinge), "pendulum", "cartpole", "arm2", "arm6" (UR5e), "arm7" (Franka
             FER), "quadrotor" (Crazyflie 2), or a path. A URDF gets a motor for each joint that
             mimics no other, with its `effort` as limit, its `velocity` limits are read (0 of
-            either: none), and its shapes are for pictures alone: it must give inertias, has no
-            contacts, needs no mesh files.
+            either, and a range from 0 to 0: none), and its shapes are for pictures alone: it must
+            give inertias, has no contacts, needs no mesh files.
         position, velocity, torque: limits in place of the file's, as `joint_limits` takes them:
             (lower, upper), each a number or one a dof (torque: one an actuator), or v for
             |.| ≤ v, inputs in units of ctrl. They bind the controller; the joint stops of the plant
@@ -643,12 +643,18 @@ def compiled_urdf(
         # A frame: MuJoCo refuses it, and it weighs nothing.
         if inertial is not None and _mass(link) == 0 and not np.any(_inertia(inertial)):
             link.remove(inertial)
+    for joint in root.iter("joint"):
+        limit = joint.find("limit")
+        if joint.get("type") == "continuous" and limit is not None:
+            for side in ("lower", "upper"):  # of no meaning there, which MuJoCo would take for one
+                limit.attrib.pop(side, None)
     if floating_base:
         _free(root)
     changes = _mended(root) if mend_inertias else ()  # the freed root link counts as moving
     velocities, mimics = _velocities(root), _mimics(root)
     try:
         spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
+        _complete_planar(root, spec)
         _add_motors(spec, mimics)
         return spec.compile(), velocities, changes
     except ValueError as error:
@@ -673,7 +679,7 @@ def _velocities(root: ElementTree.Element) -> dict[str, float]:
         except ValueError as error:
             raise ValueError(f"a limit of joint {name} is no number: {error}") from None
         lower, upper, effort, velocity = numbers
-        if not (lower < upper or lower == upper == 0 or joint.get("type") == "continuous"):
+        if not (lower < upper or lower == upper == 0):
             raise ValueError(f"joint {name} has the range [{lower:g}, {upper:g}]")
         if not (effort >= 0 and velocity >= 0):
             raise ValueError(f"joint {name} has the effort {effort:g}, the velocity {velocity:g}")
@@ -682,6 +688,15 @@ def _velocities(root: ElementTree.Element) -> dict[str, float]:
         for part in planar if joint.get("type") == "planar" else [name]:
             found[part] = velocity or np.inf
     return found
+
+
+def _complete_planar(root: ElementTree.Element, spec: "mujoco.MjSpec") -> None:
+    """Give the second slide of each planar joint the limits of the first: MuJoCo gives it none."""
+    for joint in root.iter("joint"):
+        if joint.get("type") == "planar":
+            first, second = (spec.joint(f"{joint.get('name')}_T{axis}") for axis in "XY")
+            for field in ("range", "limited", "actfrcrange", "actfrclimited"):
+                setattr(second, field, getattr(first, field))
 
 
 def _mimics(root: ElementTree.Element) -> set[str]:

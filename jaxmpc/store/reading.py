@@ -211,9 +211,9 @@ def read(
     make no sense.
 
     Blocks are read by as many threads as there are cores, each one whole and then no more. keep:
-    the fields that stay, None for all. visit: is called by these threads with each block, done or
-    not: with what is returned in the end but for the problems of blocks, the index of the first
-    sample, and all fields, (samples of the block, ...).
+    the fields that stay, None for all. visit: is called by these threads with each block: with what
+    is returned in the end but for the problems of blocks, the index of the first sample, and all
+    fields, (samples of the block, ...). A block that is not done has the fill value of each field.
     """
     path = location(path)
     if isinstance(path, Path) and (path / "zarr.json").is_file():
@@ -266,6 +266,8 @@ def _read(
     parts = regions(shape, block)
     marks = _marks(path, group, len(parts))
     kept = {name: load(name) for name in names["fields"] if keep is None or name in keep}
+    for k, name in itertools.product(np.flatnonzero(marks == 0), kept):
+        kept[name][parts[k]] = opened[name].fill_value  # what a killed run left there is no result
     problems = list[str]()
     own = {*axes, *constants, *names["fields"], "checksum"}
     for name in [name for name in described if name not in own]:  # what `Store.save` wrote
@@ -285,6 +287,8 @@ def _read(
             name: kept[name][parts[k]] if name in kept else load(name, parts[k])
             for name in names["fields"]
         }
+        if not marks[k]:
+            here = {name: np.full_like(v, opened[name].fill_value) for name, v in here.items()}
         sound = marks[k] in (0, checksum(here))
         if not sound:
             _require_files(path, here, parts[k], block, f"block {k}")

@@ -13,6 +13,7 @@ so that a step of θ is a relative change of a weight, independent of its units.
 leading axis: one for each step, each in the domain.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
@@ -142,7 +143,7 @@ class Parameter:
 def _positive(theta: Array, power: float = 1.0) -> Array:
     """Return exp θ within the positive numbers to this power, however far a step has gone."""
     numbers = jnp.finfo(theta.dtype)
-    least, most = np.log(float(numbers.tiny)), np.log(float(numbers.max))
+    least, most = math.log(float(numbers.tiny)), math.log(float(numbers.max))
     return jnp.exp(jnp.clip(theta, power * least + 1, power * most - 1))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import jaxmpc as jm
-from jaxmpc.closed_loop import Environment, LinearFeedback, randomised
+from jaxmpc.closed_loop import Environment, LinearFeedback, MPCPolicy, randomised
 
 SPREAD = 0.05
 
@@ -197,6 +197,25 @@ def test_whole_numbers_are_states(environment, linear):
         states = [one.step(one.at(np.asarray(x, kind)), [0.3]) for kind in (int, float)]
         for pair in zip(*map(jax.tree.leaves, states), strict=True):
             np.testing.assert_allclose(*pair, atol=1e-7)
+
+
+def test_rates_count_from_the_action_before():
+    """A policy without memory is told it: its loop is that of the controller, which has one."""
+    system = jm.LinearSystem([[1, 0.1], [0, 1]], [[0.005], [0.1]])
+    mpc = jm.MPC(system, np.eye(2), 0.1 * np.eye(1), 5, inputs=jm.Box([-1.0], [1.0]),
+                 input_rate_limit=[0.2])  # fmt: skip
+    controller = jm.Controller(mpc, jm.ADMM(50, newton_steps=0))
+    policy = MPCPolicy(controller, reference=np.array([1.0, 0.0]))
+    run = jm.simulate(controller, system, np.zeros(2), 4, reference=[1.0, 0.0])
+    x, u = np.zeros(2), np.zeros(1)
+    act = jax.jit(policy)
+    for expected in run.inputs:
+        u = act(x, u)
+        np.testing.assert_allclose(u, expected, atol=1e-5)
+        x = system.step(x, u)
+    assert run.inputs[-1, 0] > 0.25  # beyond what one step lets
+    with pytest.raises(ValueError, match="previous_input: is None, and the plan depends on it"):
+        policy(x)
 
 
 def test_bad_environments_are_named(environment):

@@ -44,15 +44,26 @@ def test_what_is_wrong_in_a_urdf_is_named(tmp_path):
         jm.load_robot(path)
 
 
-def test_a_planar_joint_keeps_its_velocity_limit(tmp_path):
-    """MuJoCo makes joints of other names of it."""
+def test_a_planar_joint_has_its_limits_along_both_axes(tmp_path):
+    """MuJoCo makes joints of other names of it, and limits the first one alone."""
     path = Path(tmp_path / "sled.urdf")
-    path.write_text(URDF.replace("revolute", "planar").replace('lower="-1" upper="1" ', ""))
+    path.write_text(URDF.replace("revolute", "planar"))
     robot = jm.load_robot(path)
+    np.testing.assert_array_equal(robot.input_limits.upper, [5, 5, np.inf])
+    np.testing.assert_array_equal(robot.state_limits.upper[:3], [1, 1, np.inf])
     velocities = dict(zip(robot.state_names[3:], robot.state_limits.upper[3:], strict=True))
     assert velocities == {
         "hinge_TX velocity": 2, "hinge_TY velocity": 2, "hinge_RZ velocity": np.inf
     }  # fmt: skip
+
+
+def test_a_continuous_joint_turns_without_end(tmp_path):
+    """Also where its <limit> has a range, which MuJoCo would make stops of."""
+    path = Path(tmp_path / "wheel.urdf")
+    path.write_text(URDF.replace("revolute", "continuous").replace('lower="-1"', 'lower="3"'))
+    robot = jm.load_robot(path)
+    assert not robot.mujoco.jnt_limited[0] and robot.input_limits.upper == [5]
+    np.testing.assert_array_equal(robot.state_limits.upper, [np.inf, 2])
 
 
 def test_bodies_moved_by_hand_stand_where_the_key_for_home_has_them():

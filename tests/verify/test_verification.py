@@ -1,5 +1,6 @@
 """Verification proves what is true, and finds what is not, whatever the store says."""
 
+import shutil
 from dataclasses import replace
 from fractions import Fraction
 
@@ -196,8 +197,6 @@ def sound(tmp_path_factory):
 def tampered(sound, path, name, change):
     """Return a copy of a store in which one variable is changed, with checksums to match: as one
     would leave it who made wrong labels in good faith."""
-    import shutil
-
     shutil.copytree(sound, path)
     group = zarr.open_group(path, mode="r+", use_consolidated=False)
     values = np.asarray(group[name][...])
@@ -277,6 +276,21 @@ class TestFindsWhatIsWrong:
         axes = list(store.read(sound).axes.values())
         open_labels(tmp_path / "sweep.zarr", problem, axes, {}, 128).close()
         assert "2 of 2 blocks are not done" in verify_map(tmp_path).problems[0]
+
+    def test_what_a_killed_run_left_of_a_block_is_no_result(self, sound, tmp_path):
+        """Labels without their plans: they are not counted, and nothing is said of them."""
+        path, whole = tmp_path / "sweep.zarr", verify_map(sound).labels
+        shutil.copytree(sound, path)
+        group = zarr.open_group(path, mode="r+")
+        labels = np.ravel(
+            group["label"][regions(group["label"].shape, group.attrs["variables"]["block"])[0]]
+        )
+        group["checksum"][0], group["plan"][:8] = 0, np.nan
+        found = verify_map(path)
+        assert found.problems == ["1 of 2 blocks are not done: resume the sweep"]
+        assert not found.failures and not found.passed
+        assert found.labels["feasible"] == whole["feasible"] - np.sum(labels == 1)
+        assert found.labels["undecided"] == whole["undecided"] + np.sum(labels != 0)
 
     @pytest.mark.slow
     def test_one_bit_of_any_array(self, sound):
