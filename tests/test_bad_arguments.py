@@ -792,6 +792,15 @@ CALLS = [
     ),
     ("mpc: is a LinearFeedback. Give a jm.MPC", lambda: draw_disturbances(LAW, 3, 2)),
     ("controller: is an MPC. Give a Controller", lambda: worst_disturbance(M, x, 3)),
+    (
+        "plant: has a sampling period of 0.02 s, the controller's model 0.01. Give both",
+        lambda: jm.simulate(
+            jm.Controller(mpc(system=jm.LinearSystem(A, B, dt=0.01))),
+            jm.LinearSystem(A, B, dt=0.02),
+            x,
+            3,
+        ),
+    ),
     ("x0: shape (0, 2). Give (B, 2), B ≥ 1", lambda: worst([])),
     ("x0: shape (1, 2, 2). Give (B, 2), B ≥ 1", lambda: worst([[x, x]])),
     ("x0: holds NaN or infinity. Give", lambda: worst([[0, 0], [np.nan, 0]])),

@@ -215,7 +215,7 @@ def checked_loop(
         disturbance = checked_array("disturbance", disturbance, [(steps, size)])
     if whole("delay", given.delay, 0) > 1:
         fail("delay", f"{given.delay}", "Give 0 or 1 samples; put longer delays into the model")
-    plant = _checked_plant(plant, size, controller.mpc.system.m)
+    plant = _checked_plant(plant, controller)
     if given.forecast is not None and not getattr(controller, "takes_forecasts", False):
         what = f"given to a {type(controller).__name__} whose plans take none"
         cure = 'Give a Controller, or a RobotController with linearize="set-point"'
@@ -269,8 +269,9 @@ def require_controller(controller: Any) -> None:
         fail("controller", what, cure)
 
 
-def _checked_plant(plant: Any, n: int, m: int) -> Any:
+def _checked_plant(plant: Any, controller: Feedback) -> Any:
     """Return the plant as an argument of a program; raise ValueError unless it is one and fits."""
+    n, m = controller.state_size, controller.mpc.system.m
     if not is_model(plant) or hasattr(plant, "mpc"):
         cure = "Give a LinearSystem, a Robot, or a function (x, u) -> x"
         fail("plant", f"is a {type(plant).__name__}", cure)
@@ -281,6 +282,12 @@ def _checked_plant(plant: Any, n: int, m: int) -> Any:
         what = f"has {sizes[0]} states and {sizes[1]} inputs, the controller {n} and {m}"
         cure = "Give them in its coordinates (a RobotController knows those of its robot)"
         fail("plant", what, cure)
+    model = model_of(controller)
+    here, there = (getattr(one, "dt", None) for one in (plant, model))
+    unit, other = (getattr(one, "time_unit", "s") for one in (plant, model))
+    if here and there and unit == other and abs(here - there) > 1e-6 * there:
+        what = f"has a sampling period of {here:g} {unit}, the controller's model {there:g}"
+        fail("plant", what, "Give both the same one (dt=, control_period=)")
     return arrays(as_argument(plant))
 
 

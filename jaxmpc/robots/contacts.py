@@ -41,7 +41,7 @@ from jaxmpc.qp.linalg import matmul, solve
 from jaxmpc.robots.configurations import normalised, retract
 from jaxmpc.robots.description import RobotDescription
 from jaxmpc.robots.force_limits import ForceLimits
-from jaxmpc.robots.mujoco_access import equalities, mujoco, names, number_of
+from jaxmpc.robots.mujoco_access import acts, equalities, mujoco, names, number_of
 from jaxmpc.robots.parameters import require_numbers
 from jaxmpc.robots.physics import RK4, Physics, in_force
 
@@ -62,15 +62,16 @@ STANDING = "feet_standing"
 class Feet:
     """Points of contact of feet that stand: spheres on the ground that they touch at home.
 
-    names, geoms (k,): the feet, numbers of their geoms. radius (k,). frames (k, 3, 3): rows normal
-    (towards the foot) and two tangents. friction (k,): coefficients of the plan. rate (k,): 1/s, by
-    which a foot comes to rest.
+    names, geoms (k,): the feet, numbers of their geoms. radius (k,). distance (k,): from the ground
+    at home, below 0 inside it. frames (k, 3, 3): rows normal (towards the foot) and two tangents.
+    friction (k,): coefficients of the plan. rate (k,): 1/s, by which a foot comes to rest.
     """
 
     names: tuple[str, ...]
     geoms: np.ndarray
     bodies: np.ndarray
     radius: np.ndarray
+    distance: np.ndarray
     frames: np.ndarray
     friction: np.ndarray
     rate: np.ndarray
@@ -89,18 +90,18 @@ class Feet:
         ValueError for geoms that are no spheres or do not touch.
         """
         geoms = np.array([_foot(model, name) for name in feet], np.int32)
-        near, data = _with_margins(model, geoms), mujoco.MjData(model)
-        data.qpos[:] = q
-        mujoco.mj_forward(near, data)
-        frames, coefficients, rates, depths = [], [], [], []
-        for name, geom in zip(feet, geoms, strict=True):
-            contact, sign = _ground_contact(model, data, geom)
+        if not acts(model, "contact"):
+            cure = "Load it with its contacts: contacts=True, and no flag in the file"
+            fail("robot", "has no contacts, and feet stand on the ground by these", cure)
+        frames, coefficients, rates, distances = [], [], [], []
+        found = _ground_contacts(model, q, geoms)
+        for name, geom, (contact, sign) in zip(feet, geoms, found, strict=True):
             radius = model.geom_size[geom, 0]
             if contact is None or contact.dist > _TOUCHING * radius:
                 away = "far" if contact is None else f"{contact.dist / radius:.3g} of its radius"
                 problem = f"geom {name} is {away} from the ground at home"
                 fail("feet", problem, "Give a home= in which the feet touch the ground")
-            depths.append(-contact.dist / radius)
+            distances.append(contact.dist)
             if contact.dim == 1 and friction != 0:
                 problem = f"geom {name} touches the ground without friction (condim 1)"
                 fail("feet", problem, "Write condim 3 in the file, or give friction=0")
@@ -109,6 +110,7 @@ class Feet:
             coefficient = _FRICTION * contact.friction[:2].min()
             coefficients.append(coefficient if friction is None else friction)
             rates.append(_rate(model, contact))
+        depths = -np.array(distances) / model.geom_size[geoms, 0]
         if max(depths) > _TOUCHING:
             name, by = feet[np.argmax(depths)], max(depths)
             text = f"geom {name} is {by:.2g} of its radius inside the ground at home"
@@ -118,6 +120,7 @@ class Feet:
             geoms=geoms,
             bodies=model.geom_bodyid[geoms],
             radius=model.geom_size[geoms, 0],
+            distance=np.array(distances),
             frames=np.array(frames),
             friction=np.array(coefficients),
             rate=np.array(rates),
@@ -125,6 +128,20 @@ class Feet:
 
     def __len__(self) -> int:
         return len(self.names)
+
+    def require_touching(self, argument: str, model: "mujoco.MjModel", q: np.ndarray) -> None:
+        """Raise ValueError where feet are elsewhere than on the ground at q (nq,): forces of
+        contact hold them at rest wherever they are."""
+        contacts = _ground_contacts(model, q, self.geoms)
+        for name, r, home, (contact, _) in zip(
+            self.names, self.radius, self.distance, contacts, strict=True
+        ):
+            by = np.inf if contact is None else (contact.dist - home) / r
+            if abs(by) > _TOUCHING:
+                where = f"{abs(by):.3g} of its radius {'above' if by > 0 else 'inside'}"
+                where = "far from" if contact is None else where
+                cure = "Give a configuration in which all feet touch the ground, as home does"
+                fail(argument, f"{q}: {name} is {where} the ground", cure)
 
     def jacobian(self, model: "mujoco.MjModel", data: "mujoco.MjData") -> np.ndarray:
         """Return J (3k, nv) of the velocities of the points of contact, by MuJoCo's C engine at the
@@ -173,11 +190,15 @@ def _foot(model: "mujoco.MjModel", name: str) -> int:
     return geom
 
 
-def _with_margins(model: "mujoco.MjModel", geoms: np.ndarray) -> "mujoco.MjModel":
-    """Return the model, whose contacts are found also where these geoms are near."""
-    near = copy.deepcopy(model)
+def _ground_contacts(
+    model: "mujoco.MjModel", q: np.ndarray, geoms: np.ndarray
+) -> list[tuple[Any, float]]:
+    """Return `_ground_contact` of each of these geoms at q (nq,), also where they are near."""
+    near, data = copy.deepcopy(model), mujoco.MjData(model)
     near.geom_margin[geoms] = _NEAR * model.geom_size[geoms, 0]
-    return near
+    data.qpos[:] = q
+    mujoco.mj_forward(near, data)
+    return [_ground_contact(model, data, geom) for geom in geoms]
 
 
 def _ground_contact(model: "mujoco.MjModel", data: "mujoco.MjData", geom: int) -> tuple[Any, float]:
@@ -189,7 +210,8 @@ def _ground_contact(model: "mujoco.MjModel", data: "mujoco.MjData", geom: int) -
         other = second if first == geom else first
         if geom in (first, second) and not model.body_weldid[model.geom_bodyid[other]]:
             if found[0] is None or contact.dist < found[0].dist:
-                found = contact, 1.0 if second == geom else -1.0
+                # (A copy, for contacts go with their data.)
+                found = copy.copy(contact), 1.0 if second == geom else -1.0
     return found
 
 
@@ -307,7 +329,15 @@ def _standing_physics(
     data = mujoco.MjData(model)
     data.qpos[:] = home
     mujoco.mj_forward(model, data)
-    sizes = np.linalg.svd(found.jacobian(model, data), compute_uv=False)
+    J = found.jacobian(model, data)
+    for name, frame, rows in zip(found.names, found.frames, np.split(J, len(found)), strict=True):
+        ways, sizes, _ = np.linalg.svd(rows)
+        if sizes[-1] < _RANK * sizes[0]:
+            along = np.round(frame.T @ ways[:, -1], 3) + 0.0
+            problem = f"no joint moves {name} along {along.tolist()}, where contact would push it"
+            cure = "Give the robot a free base, or legs that move a foot in all three directions"
+            fail("feet", problem, cure)
+    sizes = np.linalg.svd(J, compute_uv=False)
     if len(sizes) < 3 * len(found) or sizes[-1] < _RANK * sizes[0]:
         problem = f"{', '.join(found.names)} hold one another: contact forces are not unique"
         fail("feet", problem, "Name one sphere for each leg that moves by itself")

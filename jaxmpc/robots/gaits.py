@@ -37,6 +37,8 @@ from jaxmpc.systems.system import LinearSystem
 
 # Control periods of a swing at least: with fewer a foot does not leave the ground.
 _SWING = 3
+# Of parts of a period.
+_ROUNDING = 1e-9
 # Newton steps of inverse kinematics at most, and the distance (m) that counts as reached.
 _STEPS, _REACHED = 100, 1e-9
 
@@ -196,8 +198,8 @@ def gait(
     require_shape("offsets", starts, (len(feet),), "One for each foot")
     require_finite("offsets", starts)
 
-    phases = (np.arange(count)[:, None] / count - starts) % 1.0
-    standing = phases < duty - 1e-9
+    phases = _phases(count, starts)
+    standing = phases < duty - _ROUNDING
     _require_swings(feet, standing, duty)
     path = TrunkPath(np.asarray(velocity, float), np.asarray(turn, float), x_rest[:2])
     goals = np.empty((count, len(feet), 3))
@@ -221,14 +223,27 @@ def gait(
     )
 
 
+def _phases(count: int, starts: np.ndarray) -> np.ndarray:
+    """Return for each of `count` control periods of a period and each foot (k,) which part of the
+    period has gone since it began to stand, in [0, 1); -1e-17 is the beginning, not the end."""
+    parts = np.arange(count)[:, None] / count - starts
+    return np.maximum((parts + _ROUNDING) % 1.0 - _ROUNDING, 0.0)
+
+
 def _require_level_ground(robot: Robot) -> None:
-    """Raise ValueError unless the feet stand on ground whose normal is z."""
-    predictor: Any = robot.predictor
-    normals = predictor.feet.frames[:, 0]
+    """Raise ValueError unless the feet stand on ground whose normal is z, at one height."""
+    feet: Any = robot.predictor.feet  # type: ignore[attr-defined]
+    normals = feet.frames[:, 0]
     tilts = np.abs(normals - [0, 0, 1]).max(axis=1)
     if tilts.max() > 1e-6:
         what = f"stands on ground with the normal {np.round(normals[tilts.argmax()], 4).tolist()}"
         cure = "Turn the world of the file so that z is up: the trunk moves in x and y"
+        fail("robot", what, cure)
+    ground = _places(robot.mujoco, robot.home[: robot.mujoco.nq], feet.names)[:, 2]
+    ground = ground - feet.radius - feet.distance
+    if np.ptp(ground) > 1e-3 * feet.radius.min():
+        what = f"stands at the heights {np.round(ground, 4).tolist()} m"
+        cure = "Give a home= on flat ground: each foot steps on ground as high as it began on"
         fail("robot", what, cure)
 
 

@@ -190,10 +190,14 @@ class Robot(RobotDescription):
         argument that gave q."""
         q = self.configurations(argument, q)
         rows, couplings = q.reshape(-1, q.shape[-1]), Couplings(self.predictor.model)
+        feet: Any = getattr(self.predictor, "feet", None)
+        if feet is not None:
+            for row in rows:
+                feet.require_touching(argument, self.mujoco, row)
         rests = [rest_at(self, self._coupled(argument, row, couplings)) for row in rows]
         cure = "Choose a configuration that the actuators hold, or search for one: "
         cure += "robot.equilibrium(near=q)"
-        if hasattr(self.predictor, "feet"):
+        if feet is not None:
             cure = "Choose another configuration, or give more torque, or feet with more friction"
         for rest in rests:
             if not rest.balanced:

@@ -266,12 +266,49 @@ def test_what_cannot_stand_is_named(quadruped):
         home = quadruped.home + raised * np.eye(quadruped.state_size)[2]
         with pytest.raises(ValueError, match=message):
             replace(quadruped, home=home).standing(FEET)
+    blind = copy.deepcopy(quadruped.mujoco)
+    blind.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+    with pytest.raises(ValueError, match="robot: has no contacts, .* contacts=True"):
+        replace(quadruped, plant=SimpleNamespace(model=blind)).standing(FEET)
     model = copy.deepcopy(quadruped.predictor.model)
     model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
     with pytest.raises(ValueError, match="RK4"):
         replace(quadruped, predictor=SimpleNamespace(model=model)).standing(FEET)
     robot = quadruped.standing(FEET)
     assert "feet that stand in linear models: FL, FR, RL, RR" in str(robot.report())
+
+
+def test_feet_rest_on_the_ground_alone(quadruped, standing):
+    """In the air and inside the ground forces of contact balance the weight as well."""
+    home, up = standing.home[: standing.mujoco.nq], np.eye(standing.mujoco.nq)[2]
+    for raised, where in (
+        (0.5, "far from"),
+        (0.02, "0.66.* of its radius above"),
+        (-0.02, "0.66.* of its radius inside"),
+    ):
+        with pytest.raises(ValueError, match=rf"(?s)q: .*: foot is {where} the ground"):
+            standing.equilibrium(home + raised * up)
+    x, _ = standing.equilibrium(home + 1e-4 * up)
+    np.testing.assert_allclose(x[2], home[2] + 1e-4)
+    turned = quadruped.standing(FEET).home[: quadruped.mujoco.nq].copy()
+    turned[7] += 0.5  # one leg in the air
+    with pytest.raises(ValueError, match="(?s)target: .*: FL is .* the ground"):
+        jm.robot_mpc(quadruped.standing(FEET), horizon=3, target=turned)
+
+
+def test_feet_that_nothing_moves_sideways_are_named():
+    """Of a robot in a plane, where a force across it would be any."""
+    free = '<freejoint name="base"/>'
+    plane = """<joint name="x" type="slide" axis="1 0 0"/>
+    <joint name="z" type="slide" axis="0 0 1"/><joint name="turn" axis="0 1 0"/>"""
+    height = 0.6 * np.cos(BEND) + 0.0299
+    text = HOPPER.format(height=height, shift=0, bend=BEND, back=-2 * BEND)
+    text = text.replace(free, plane).replace('<joint name="abduction" axis="1 0 0"/>', "")
+    text = text.replace('<motor joint="abduction" ctrlrange="-30 30"/>', "")
+    text = re.sub('<key qpos="[^"]*"', f'<key qpos="0 0 0 {BEND} {-2 * BEND}"', text)
+    robot = jm.load_robot(mujoco.MjModel.from_xml_string(text))
+    with pytest.raises(ValueError, match=r"no joint moves foot along \[-?0.0, -?1.0, -?0.0\]"):
+        robot.standing(["foot"])
 
 
 @pytest.mark.slow

@@ -1,8 +1,10 @@
 """Gaits: motions against MuJoCo's kinematics, their linear models against those of the feet that
 stand, the periodic LQR against lifted Riccati equations, and a quadruped that trots in MuJoCo."""
 
+import itertools
 import re
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -18,7 +20,7 @@ import jaxmpc as jm
 from jaxmpc.closed_loop import GaitController, KalmanFilter
 from jaxmpc.closed_loop.gait_controller import _require_free_trunk, periodic_cost_to_go
 from jaxmpc.robots.contacts import STANDING
-from jaxmpc.robots.gaits import TrunkPath, _paths
+from jaxmpc.robots.gaits import TrunkPath, _paths, _phases
 from jaxmpc.robots.robot import RobotModel
 
 QUADRUPED = Path(__file__).parents[2] / "experiments" / "robots" / "quadruped.xml"
@@ -151,6 +153,35 @@ def test_what_is_no_gait_is_named(robot, given, text):
     """Before anything is compiled."""
     with pytest.raises(ValueError, match=text):
         jm.robots.gait(**{"robot": robot, "feet": FEET, **given})
+
+
+def test_feet_stand_from_the_period_in_which_they_begin():
+    """However their offsets were computed: beside exact fractions."""
+    for count, feet in itertools.product((5, 24, 40, 45, 60), (2, 3, 4, 5, 6)):
+        given = [np.linspace(0, 1, feet, endpoint=False), np.arange(feet) / feet]
+        given += [np.arange(feet) * (1 / feet), np.cumsum(np.full(feet, 1 / feet)) - 1 / feet]
+        for starts, step in itertools.product(given, (1, -1)):
+            found = _phases(count, starts[::step])
+            for (k, i), phase in np.ndenumerate(found):
+                start = Fraction(range(feet)[::step][i], feet)
+                assert abs(Fraction(phase) - (Fraction(k, count) - start) % 1) < 2e-9
+
+
+def test_a_step_under_two_feet_is_refused(robot):
+    """References have each foot step on ground as high as where it began."""
+    home, data = robot.home[: robot.mujoco.nq].copy(), mujoco.MjData(robot.mujoco)
+    home[3:5] = np.cos(0.03), np.sin(0.03)  # the left side of the trunk is higher
+    data.qpos[:] = home
+    mujoco.mj_kinematics(robot.mujoco, data)
+    left, right = (data.geom(foot).xpos[2] for foot in ("FL", "FR"))
+    assert left > right + 0.01
+    home[2] += 0.022 - right
+    half = (left - right) / 2
+    step = f'<geom type="box" size=".4 .2 {half}" pos="0 .25 {half}" conaffinity="1"/><body'
+    model = mujoco.MjModel.from_xml_string(QUADRUPED.read_text().replace("<body", step, 1))
+    stepped = jm.load_robot(model, home=home)
+    with pytest.raises(ValueError, match=r"stands at the heights .* on flat ground"):
+        jm.robots.gait(stepped, FEET)
 
 
 def test_grounds_that_are_not_level_are_refused():
