@@ -34,6 +34,7 @@ def qp(**changes):
 M = mpc()
 BOX = M.states
 LAW = jm.closed_loop.LinearFeedback(M, np.zeros((1, 2)))
+TIMED = jm.Controller(mpc(system=jm.LinearSystem(A, B, dt=0.01)))
 
 
 def fraction(x0s=((0, 0),), **more):
@@ -794,12 +795,7 @@ CALLS = [
     ("controller: is an MPC. Give a Controller", lambda: worst_disturbance(M, x, 3)),
     (
         "plant: has a sampling period of 0.02 s, the controller's model 0.01. Give both",
-        lambda: jm.simulate(
-            jm.Controller(mpc(system=jm.LinearSystem(A, B, dt=0.01))),
-            jm.LinearSystem(A, B, dt=0.02),
-            x,
-            3,
-        ),
+        lambda: jm.simulate(TIMED, jm.LinearSystem(A, B, dt=0.02), x, 3),
     ),
     ("x0: shape (0, 2). Give (B, 2), B ≥ 1", lambda: worst([])),
     ("x0: shape (1, 2, 2). Give (B, 2), B ≥ 1", lambda: worst([[x, x]])),
