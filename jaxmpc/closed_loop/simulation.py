@@ -224,8 +224,11 @@ def checked_loop(
     own = getattr(controller, "observer", None)
     if own is not None and observer is not None:
         fail("observer", "given beside that of the controller", "Leave it out")
+    if own is not None:
+        _require_period("controller.observer.model", own.model, controller)
     if observer is not None:
         require_kind("observer", observer, KalmanFilter, cure="Give a closed_loop.KalmanFilter")
+        _require_period("observer.model", observer.model, controller)
         observer = arrays(observer.prepared())
         if observer.model.n != n:
             what = f"has {observer.model.n} states, the controller's model {n}"
@@ -282,13 +285,18 @@ def _checked_plant(plant: Any, controller: Feedback) -> Any:
         what = f"has {sizes[0]} states and {sizes[1]} inputs, the controller {n} and {m}"
         cure = "Give them in its coordinates (a RobotController knows those of its robot)"
         fail("plant", what, cure)
-    model = model_of(controller)
-    here, there = (getattr(one, "dt", None) for one in (plant, model))
-    unit, other = (getattr(one, "time_unit", "s") for one in (plant, model))
+    _require_period("plant", plant, controller)
+    return arrays(as_argument(plant))
+
+
+def _require_period(argument: str, model: Any, controller: Feedback) -> None:
+    """Raise ValueError where a model has another sampling period than that of the controller."""
+    both = model, model_of(controller)
+    here, there = (getattr(one, "dt", None) for one in both)
+    unit, other = (getattr(one, "time_unit", "s") for one in both)
     if here and there and unit == other and abs(here - there) > 1e-6 * there:
         what = f"has a sampling period of {here:g} {unit}, the controller's model {there:g}"
-        fail("plant", what, "Give both the same one (dt=, control_period=)")
-    return arrays(as_argument(plant))
+        fail(argument, what, "Give both the same one (dt=, control_period=)")
 
 
 # What goes from one time step to the next: the state, what the controller gave at the step before,
