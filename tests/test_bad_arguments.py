@@ -797,16 +797,6 @@ CALLS = [
         "plant: has a sampling period of 0.02 s, the controller's model 0.01. Give both",
         lambda: jm.simulate(TIMED, jm.LinearSystem(A, B, dt=0.02), x, 3),
     ),
-    (
-        "observer.model: has a sampling period of 0.02 s, the controller's model 0.01. Give",
-        lambda: jm.simulate(
-            TIMED,
-            S,
-            x,
-            3,
-            observer=jm.closed_loop.KalmanFilter(jm.LinearSystem(A, B, dt=0.02), np.ones(2), 1.0),
-        ),
-    ),
     ("x0: shape (0, 2). Give (B, 2), B ≥ 1", lambda: worst([])),
     ("x0: shape (1, 2, 2). Give (B, 2), B ≥ 1", lambda: worst([[x, x]])),
     ("x0: holds NaN or infinity. Give", lambda: worst([[0, 0], [np.nan, 0]])),

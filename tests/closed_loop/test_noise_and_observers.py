@@ -1,5 +1,7 @@
 """Noise, Kalman filters, delays and references of each loop, against linear theory."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -574,7 +576,7 @@ def test_bad_noise_and_observers_are_named():
     unstable = jm.LinearSystem(np.diag([1.2, 1.1]), np.ones((2, 1)))
     run = lambda **given: jm.simulate(LAW, SYSTEM, np.zeros(2), 4, **given)
     many = lambda **given: jm.simulate_many(LAW, SYSTEM, np.zeros((5, 2)), 4, **given)
-    robot = jm.load_robot("pendulum")
+    robot = jm.load_robot("pendulum", control_period=T)
     for call, message in (
         (lambda: run(noise=Noise([1.0, 1.0, 1.0])), r"noise.process: shape \(3,\). Give standard"),
         (lambda: run(noise=Noise(measurement=-1.0)), "noise.measurement: has a negative"),
@@ -609,6 +611,10 @@ def test_bad_noise_and_observers_are_named():
         (
             lambda: run(observer=KalmanFilter(unstable, [1.0, 0.0], 1.0, C=np.eye(2))),
             "observer.process: no noise moves the mode with eigenvalue 1.1. Give it some, or init",
+        ),
+        (
+            lambda: run(observer=KalmanFilter(replace(SYSTEM, dt=0.2), 1.0, 1.0)),
+            "observer.model: has a sampling period of 0.2 s, the controller's model 0.1. Give both",
         ),
         (
             lambda: run(observer=KalmanFilter(robot, 1.0, 1.0)),
