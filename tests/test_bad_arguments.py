@@ -34,7 +34,6 @@ def qp(**changes):
 M = mpc()
 BOX = M.states
 LAW = jm.closed_loop.LinearFeedback(M, np.zeros((1, 2)))
-TIMED = jm.Controller(mpc(system=jm.LinearSystem(A, B, dt=0.01)))
 
 
 def fraction(x0s=((0, 0),), **more):
@@ -795,7 +794,7 @@ CALLS = [
     ("controller: is an MPC. Give a Controller", lambda: worst_disturbance(M, x, 3)),
     (
         "plant: has a sampling period of 0.02 s, the controller's model 0.01. Give both",
-        lambda: jm.simulate(TIMED, jm.LinearSystem(A, B, dt=0.02), x, 3),
+        lambda: jm.simulate(LAW, jm.LinearSystem(A, B, dt=0.02), x, 3),
     ),
     ("x0: shape (0, 2). Give (B, 2), B ≥ 1", lambda: worst([])),
     ("x0: shape (1, 2, 2). Give (B, 2), B ≥ 1", lambda: worst([[x, x]])),
@@ -982,6 +981,13 @@ def test_arguments_that_do_not_exist_or_are_missing(message, call):
 def test_a_misspelt_argument_of_a_design_is_named_before_any_work():
     with pytest.raises(TypeError, match="design: there is no argument limts. Did you mean limits"):
         jm.design(S, np.eye(2), np.eye(1), 3, limts=1)
+
+
+def test_a_plant_without_a_period_fits_any_controller():
+    system = dataclasses.replace(S, dt=None)
+    boxes = jm.Box([-1.0, -1.0], [1.0, 1.0]), jm.Box([-1.0], [1.0])
+    for plant in (system, jm.LinearPlant(system, *boxes), lambda x, u: x):
+        jm.simulate(LAW, plant, x, 1)
 
 
 @pytest.mark.parametrize(

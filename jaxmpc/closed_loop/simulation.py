@@ -291,9 +291,10 @@ def _checked_plant(plant: Any, controller: Feedback) -> Any:
 
 def _require_period(argument: str, model: Any, controller: Feedback) -> None:
     """Raise ValueError where a model has another sampling period than that of the controller."""
-    both = model, model_of(controller)
-    here, there = (getattr(one, "dt", None) for one in both)
-    unit, other = (getattr(one, "time_unit", "s") for one in both)
+    both = (getattr(one, "system", one) for one in (model, model_of(controller)))
+    (here, unit), (there, other) = (
+        (getattr(one, "dt", None), getattr(one, "time_unit", "s")) for one in both
+    )
     if here and there and unit == other and abs(here - there) > 1e-6 * there:
         what = f"has a sampling period of {here:g} {unit}, the controller's model {there:g}"
         fail(argument, what, "Give both the same one (dt=, control_period=)")
