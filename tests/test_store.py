@@ -413,10 +413,12 @@ class TestDamage:
         others.append(full.with_name(".s1.zarr.keep"))
         for other in others:
             other.mkdir()
-        partial = full / "label" / "c" / "0" / "0.123.partial"
-        partial.touch()
+        partials = [full / "label/c/0/0.123.partial", full / "checksum/c/0.4e5f.partial"]
+        for partial in partials:
+            partial.touch()
+        assert not store.read(full).problems  # they are no results, and no damage
         open_store(full).close()
-        assert not orphan.exists() and not partial.exists()
+        assert not any(left.exists() for left in (orphan, *partials))
         assert all(other.exists() for other in others)
 
     def test_one_bit(self, full):

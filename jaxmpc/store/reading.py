@@ -6,7 +6,7 @@ First where a store lies, then the blocks of its grid and the hashes of their da
 import hashlib
 import itertools
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
@@ -390,11 +390,16 @@ def _marks(path: Path | str, group: "zarr.Group", count: int) -> np.ndarray:
     array, marks = array_of(group, "checksum"), np.zeros(count, np.uint64)
     if isinstance(path, str):
         return np.asarray(array[:])
-    for file in (path / "checksum" / "c").glob("*"):
+    for file in _finished(path / "checksum" / "c", "*"):
         if not (file.name.isdecimal() and int(file.name) < count):
             fail("checksum", f"holds {shown(file.name)}, which is of no block", "Overwrite it")
         marks[int(file.name)] = array[int(file.name)]
     return marks
+
+
+def _finished(folder: Path, pattern: str) -> Iterator[Path]:
+    """Return files and folders but for those that zarr is writing, or was as its run was killed."""
+    return (file for file in folder.glob(pattern) if file.suffix != ".partial")
 
 
 def _require_files(
@@ -417,7 +422,7 @@ def _stored_bytes(path: Path) -> int:
     """Return the bytes of all files of a store. Raises ValueError where one is no ordinary file,
     such as a pipe, which would be waited for."""
     total = 0
-    for file in path.rglob("*"):
+    for file in _finished(path, "**/*"):
         if not file.is_file() and not file.is_dir():
             fail(str(file.relative_to(path)), "is no file", "Overwrite the store")
         total += file.stat().st_size if file.is_file() else 0
