@@ -3,6 +3,7 @@
 import inspect
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields, is_dataclass
+from enum import Enum
 from functools import partial
 from pathlib import Path
 from types import CodeType, FunctionType, MethodType, ModuleType
@@ -196,6 +197,10 @@ def plain_data(value: Any, within: tuple[int, ...] = ()) -> Any:
     parts = lambda held: plain_data(held, (*within, id(value)))
     if is_dataclass(value) and not isinstance(value, type):
         return {field.name: parts(getattr(value, field.name)) for field in fields(value)}
+    if isinstance(value, set | frozenset):
+        return sorted(map(repr, value))
+    if isinstance(value, Enum | np.dtype | bytes | complex | range | slice):
+        return repr(value)
     if isinstance(value, tuple | list):
         return list(map(parts, value))
     if isinstance(value, Mapping):

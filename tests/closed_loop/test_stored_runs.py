@@ -126,6 +126,7 @@ def test_functions_are_told_apart_by_what_they_do(joint, feedback):
         of_module(1.0), of_module(2.0), of_module(np.ones(2)),
     ]  # fmt: skip
     seen = [json.dumps(plain_data(Task(function, weight=1.0))) for function in others]
+    seen += [json.dumps(plain_data(held)) for held in ({1, 2}, {1, 3}, range(2), range(3), b"a")]
     assert len(set(seen)) == len(seen)
 
 
