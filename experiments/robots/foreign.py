@@ -12,6 +12,9 @@ kept       share of samples whose state limits are kept to 1 % of their half-wid
 worst      the most that a state limit was exceeded, in half-widths
 C          the largest difference of the plant from MuJoCo's C engine after 25 periods of random
            inputs about the set-point, in units of the state, relative above 1
+slopes     how far A and B of the linear model about the set-point (exact=True) are from differences
+           of a period of the C engine, beyond both one-sided ones, relative to the largest of each
+           column; with an asterisk where stops or contacts act there, which linear models leave out
 drift      how far the C engine moves from the set-point in 25 periods under its input, likewise
 promise    share of plans SOLVED without fallback after which the next state keeps its limits
 ignored    what the predictor does not know, what was left out of the plant
@@ -258,7 +261,7 @@ def tried(name: str, s: Settings) -> dict[str, Any]:
     text = " ".join(row["warnings"])
     none, near = "no input holds home", "the nearest configuration"
     row["rest"] = "none" if none in text else "near" if near in text else "home"
-    row |= beside_c(robot, x, u, s.seed)
+    row |= beside_c(robot, x, u, s.seed) | slopes_beside_c(robot, x, u)
     if mpc is None:
         return row
     controller = jm.RobotController(robot, mpc, linearize=s.linearize)
@@ -313,6 +316,38 @@ def beside_c(robot: Any, x: np.ndarray, u: np.ndarray, seed: int) -> dict[str, f
     return {"C": apart(plant, ends[0]), "drift": apart(ends[1], x)}
 
 
+def slopes_beside_c(robot: Any, x: np.ndarray, u: np.ndarray) -> dict[str, Any]:
+    """Return how far A and B are from differences of a period of the C engine, beyond both
+    one-sided ones, relative to the largest of each column; and whether constraints act there."""
+    import jax
+    import mujoco
+
+    model, h = robot.mujoco, 1e-6
+    to_state, to_coordinates = jax.jit(robot.state), jax.jit(robot.coordinates)
+    data = mujoco.MjData(model)
+
+    def after(xi: np.ndarray, u: np.ndarray) -> np.ndarray:
+        mujoco.mj_resetData(model, data)
+        parts = np.split(np.asarray(to_state(xi)), [model.nq, model.nq + model.nv])
+        data.qpos, data.qvel, data.act = parts
+        data.ctrl = u
+        mujoco.mj_step(model, data, robot.substeps)
+        return np.asarray(to_coordinates(np.concatenate([data.qpos, data.qvel, data.act])))
+
+    system = robot.linearize(x, u, exact=True)
+    slopes = np.hstack([np.asarray(system.A), np.asarray(system.B)])
+    point = np.append(np.asarray(to_coordinates(x)), u)
+    here, worst = after(*np.split(point, [robot.n])), 0.0
+    acting = data.nefc > 0
+    for i, slope in enumerate(slopes.T):
+        moved = point + h * np.eye(len(point))[i], point - h * np.eye(len(point))[i]
+        up, down = (after(*np.split(one, [robot.n])) for one in moved)
+        sides = np.sort([(up - here) / h, (here - down) / h], axis=0)
+        beyond = np.maximum(sides[0] - slope, slope - sides[1]).max()
+        worst = max(worst, beyond / (np.abs(sides).max() + 1e-9))
+    return {"slopes": worst, "acting": bool(acting)}
+
+
 def starts(robot: Any, mpc: Any, x: np.ndarray, s: Settings) -> np.ndarray:
     """Return states (robots, nq + nv + na) about x: hinge and slide joints moved by at most a tenth
     of the half-width of their range, inside the limits of the problem."""
@@ -360,8 +395,8 @@ def run(s: Settings) -> None:
 
 
 TITLE = (
-    f"{'':40}{'n':>4}{'m':>4}{'load s':>8}{'C':>9}{'drift':>9}{'run s':>7}  rest{'solved':>8}"
-    f"{'fallback':>9}{'promise':>8}{'kept':>7}{'worst':>8}  ignored"
+    f"{'':40}{'n':>4}{'m':>4}{'load s':>8}{'C':>9}{'slopes':>10}{'drift':>9}{'run s':>7}  rest"
+    f"{'solved':>8}{'fallback':>9}{'promise':>8}{'kept':>7}{'worst':>8}  ignored"
 )
 
 
@@ -372,7 +407,8 @@ def line(row: dict[str, Any]) -> str:
         if key in row:
             return f"{name:40}{key}: {row[key]}"
     start = f"{name:40}{row['n']:>4}{row['m']:>4}{row['load']:>8.1f}"
-    start += f"{row['C']:>9.0e}{row['drift']:>9.0e}"
+    slopes = f"{row['slopes']:.0e}{'*' if row['acting'] else ' '}"
+    start += f"{row['C']:>9.0e}{slopes:>10}{row['drift']:>9.0e}"
     ignored = "; ".join(row["ignored"])
     if "solved" not in row:
         return f"{start}{'':7}  {row['rest']:4}{'':40}  {ignored}"
