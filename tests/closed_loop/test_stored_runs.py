@@ -130,13 +130,12 @@ def test_functions_are_told_apart_by_what_they_do(joint, feedback):
     assert len(set(seen)) == len(seen)
 
 
-def test_models_are_told_apart_by_their_numbers(joint):
+def test_models_are_told_apart_by_their_numbers(joint, feedback):
     """Those that predict have the names that they had after an edit of their file."""
     heavier = copy.copy(joint.mujoco)
     heavier.body_mass[:] *= 2
-    mpc = jm.robot_mpc(joint, horizon=3)
     one, other, same = (
-        plain_data(jm.RobotController(robot, mpc, linearize="trajectory"))
+        plain_data(jm.RobotController(robot, feedback.mpc, linearize="trajectory"))
         for robot in (joint, dataclasses.replace(joint, predictor=Physics(heavier)), joint)
     )
     assert one == same != other
