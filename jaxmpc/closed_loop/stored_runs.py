@@ -213,7 +213,7 @@ def plain_data(value: Any, within: tuple[int, ...] = ()) -> Any:
         code = function.__code__
         closed_over = [cell.cell_contents for cell in function.__closure__ or ()]
         held = closed_over, function.__defaults__, function.__kwdefaults__
-        return [_plain_code(code), *map(parts, (*held, _read(code, function.__globals__)))]
+        return [_plain_code(code), *map(parts, (*held, _module_data(code, function.__globals__)))]
     if isinstance(value, type | ModuleType):
         return value.__name__
     if type(value).__name__ == "MjModel":
@@ -230,10 +230,10 @@ def _plain_code(code: CodeType) -> list[Any]:
     return [code.co_code.hex(), list(code.co_names), constants]
 
 
-def _read(code: CodeType, names: Mapping[str, Any]) -> dict[str, Any]:
+def _module_data(code: CodeType, names: Mapping[str, Any]) -> dict[str, Any]:
     """Return those of the module's names that a function reads, but for modules, types and
     functions."""
-    inner = [_read(v, names) for v in code.co_consts if isinstance(v, CodeType)]
+    inner = [_module_data(v, names) for v in code.co_consts if isinstance(v, CodeType)]
     own = {key: names[key] for key in code.co_names if key in names}
     found = {k: v for k, v in own.items() if not (callable(v) or isinstance(v, ModuleType))}
     return found | {key: v for part in inner for key, v in part.items()}
