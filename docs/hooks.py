@@ -84,8 +84,9 @@ def on_page_content(content: str, page: Any, config: Any, files: Files) -> str:
 def _kept(formula: str, display: str) -> str:
     """Keep a formula in TeX as MathML; return the word that stands for it."""
     word = f"formula{display}{len(FORMULAS)}end"
-    # What LaTeX calls aligned, its converter knows as align*.
-    formula = formula.strip().replace("{aligned}", "{align*}")
+    # What LaTeX calls aligned, its converter knows as align*. Of a prime it makes an exponent,
+    # small and too high in browsers, where the character is raised by itself.
+    formula = formula.strip().replace("{aligned}", "{align*}").replace("'", r"\text{′}")
     FORMULAS[word] = convert(formula, display=display)
     return f"\n\n{word}\n\n" if display == "block" else word
 

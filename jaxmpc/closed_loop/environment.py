@@ -135,6 +135,9 @@ class Environment:
         """Return the state one control period later, under the action (m,)."""
         robot, dtype = self.robot, state.x.dtype
         require_shape("action", action, (robot.m,), "One number an input; use jax.vmap for many")
+        at_rest = "An episode has one target, at rest; use jax.vmap for many"
+        require_shape("reference", self.reference, (robot.n,), at_rest)
+        require_shape("input_reference", self.input_reference, (robot.m,), at_rest)
         u = limited(robot.input_limits, jnp.asarray(action, dtype))
         xi, target = robot.coordinates(state.x), jnp.asarray(self.reference, dtype)
         error = error_of(robot, robot.state_limits, xi, target)

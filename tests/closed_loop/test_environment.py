@@ -191,6 +191,7 @@ def test_gymnasium_accepts_it(environment):
     assert terminated and info["violation"] > 0
 
 
+@pytest.mark.long
 def test_whole_numbers_are_states(environment, linear):
     """A state of integers is that of floats: nothing is rounded to it."""
     for one, x in ((environment, [0, 0]), (linear, np.array([1, 0]))):
@@ -199,6 +200,7 @@ def test_whole_numbers_are_states(environment, linear):
             np.testing.assert_allclose(*pair, atol=1e-7)
 
 
+@pytest.mark.long
 def test_rates_count_from_the_action_before():
     """A policy without memory is told it: its loop is that of the controller, which has one."""
     system = jm.LinearSystem([[1, 0.1], [0, 1]], [[0.005], [0.1]])
@@ -241,6 +243,14 @@ def test_bad_environments_are_named(environment):
             r"key: is an array of keys, shape \(3,\). Give one, or use jax.vmap",
         ),
         (lambda: environment.step(state, np.zeros(2)), r"action: shape \(2,\) where \(1,\)"),
+        (
+            lambda: replace(environment, reference=np.zeros((13, 2))).step(state, np.zeros(1)),
+            r"reference: shape \(13, 2\) where \(2,\).* one target, at rest",
+        ),
+        (
+            lambda: replace(environment, input_reference=np.zeros((12, 1))).step(state, [0.0]),
+            r"input_reference: shape \(12, 1\) where \(1,\)",
+        ),
         (lambda: policy(np.zeros(3)), r"observation: shape \(3,\) where"),
     ):
         with pytest.raises(ValueError, match=message):

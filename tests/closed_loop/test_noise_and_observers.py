@@ -352,6 +352,7 @@ def followed(robot, kinds, seed=0, **numbers):
     return observer.split(np.asarray(mean))[1]
 
 
+@pytest.mark.long
 def test_numbers_of_a_robot_are_estimated(loaded):
     """A payload, the damping of a joint and the strength of a motor, each alone and together."""
     gear = np.eye(6, 1)
@@ -366,6 +367,7 @@ def test_numbers_of_a_robot_are_estimated(loaded):
     np.testing.assert_allclose(found, [changes[k] for k in both], rtol=1e-3)
 
 
+@pytest.mark.long
 def test_numbers_that_cannot_be_negative_are_held_at_zero(loaded):
     """An estimate below 0, as noise gives one of no payload, is no error; and it comes back."""
     load = Disturbance("payload", 1e-3, initial=0.5)

@@ -212,6 +212,7 @@ class TestExactPenalty:
         assert not found.exact and found.method == "samples" and found.regions is not None
         assert found.rho_bar == pytest.approx(11.25, rel=1e-9)
 
+    @pytest.mark.long
     def test_of_what_is_tracked(self):
         """A target beyond a limit presses plans against it: the threshold of the origin is too
         small there, and slacks appear at states from which the limit can be kept."""

@@ -68,6 +68,7 @@ def test_every_state_has_the_input_of_its_region(regions, tmp_path, dtype, error
 
 @compiled
 @pytest.mark.parametrize("dtype, error", [("float64", 1e-9), ("float32", 2e-4)])
+@pytest.mark.long
 def test_where_many_facets_meet(tmp_path, dtype, error):
     """Rounding gives signs there that fit no region, and led to a leaf far away."""
     A = np.array([[1.0, 1, 1], [0, 1, 1], [0, 0, 1]])

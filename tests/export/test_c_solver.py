@@ -174,6 +174,7 @@ def test_status_is_true_and_bad_states_are_answered(tmp_path):
 
 
 @compiled
+@pytest.mark.long
 def test_rates_count_from_a_last_input_beyond_the_limits(tmp_path):
     """With inputs of at most 1 and rates of 0.3 the next is 0.9 after 1.2, and none after 1.6."""
     system = jm.LinearSystem([[1, 0.1], [0, 1]], [[0.005], [0.1]])

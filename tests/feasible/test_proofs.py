@@ -93,6 +93,7 @@ class TestProofs:
                 if proved:
                     assert exact.keeps_all_rows(mpc, x0, clipped)
 
+    @pytest.mark.long
     def test_sums_of_one_term_are_not_rounded(self):
         """A chain of integrators at rest on a limit stays there, exactly; what is proved is so in
         rationals, whichever states and inputs are zero."""

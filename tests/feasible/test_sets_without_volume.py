@@ -65,6 +65,7 @@ def test_flat_feasible_sets():
     assert feasible_growth(robust, [2]).volume[0] == 0
 
 
+@pytest.mark.long
 def test_a_flat_terminal_set_of_many_states_is_no_flat_feasible_set():
     """Above four dimensions X_N is computed backwards from it, which says nothing of its volume."""
     system = jm.LinearSystem(np.eye(5) + 0.5 * np.eye(5, k=1), np.eye(5)[:, -1:])

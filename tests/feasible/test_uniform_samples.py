@@ -181,6 +181,7 @@ def test_a_data_set(samples, tmp_path):
 
 
 @pytest.mark.parametrize(("axes", "fixed"), [((1, 0), None), ((1,), [0.2, 0.0])])
+@pytest.mark.long
 def test_states_are_in_the_order_of_the_problem(axes, fixed):
     """Whatever order or part of the coordinates the points are in."""
     mpc = replace(MPC, states=jm.Box([-1.0, -3.0], [1.0, 3.0]))

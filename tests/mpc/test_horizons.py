@@ -117,6 +117,7 @@ def test_policies_of_unbounded_sets_have_no_map(policy, states):
     assert jm.map_feasible_set(plain, np.zeros((2, 2))).label.tolist() == [1, 1]
 
 
+@pytest.mark.long
 def test_constant_forecasts_are_of_the_steps_of_the_problem():
     """Not of those that are added, also where nothing can be read."""
     mpc = problem(3, outputs=(), soft=())

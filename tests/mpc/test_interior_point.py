@@ -94,6 +94,7 @@ def test_soft_rows_without_a_penalty_are_no_rows():
     np.testing.assert_allclose(plans.cost, others.cost, rtol=1e-7)
 
 
+@pytest.mark.long
 def test_plans_that_dose_nothing():
     """u ≥ 0 alone: with A, B, x0 ≥ 0 all states, and all costs, grow with every input."""
     rng, problems, costs = np.random.default_rng(0), [], []

@@ -67,6 +67,7 @@ def test_plans_are_those_of_solve(plans, states):
     np.testing.assert_allclose(plans.cost[some], one.cost, rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.long
 def test_a_state_with_nan_is_marked_and_changes_nothing_else(states):
     mpc = problems.joint_o_inf(10)
     clean = jm.solve_many(mpc, states[:200], chunk=64)  # the program of `plans`

@@ -593,6 +593,7 @@ def test_derivatives_of_a_batch_of_plans_without_limits():
 
 
 @pytest.mark.parametrize("name", ["Q", "R"])
+@pytest.mark.long
 def test_traced_weights_leave_the_gain_of_known_dynamics(name):
     """Without it 60 steps of an unstable plant are beyond the solver."""
     system = jm.LinearSystem([[1.6, 0.3], [0.0, 1.4]], [[0.1], [0.5]])

@@ -442,6 +442,7 @@ def test_bad_arguments(name, x64):
         call(around())
 
 
+@pytest.mark.long
 def test_what_has_one_meaning_is_taken(x64):
     """Models and tasks that give lists and tuples; stages as a number, a range or an array."""
     problem = around(steps=3)

@@ -528,6 +528,7 @@ def test_a_state_far_off_is_solved_within_limits_or_not(one, x64):
 
 
 @pytest.mark.parametrize("steps", [{}, {"newton_steps": 0}, {"iterations": 20}])
+@pytest.mark.long
 def test_a_prediction_that_overflows_is_no_matter_of_more_steps(steps, x64):
     """As `solve` says of it."""
     mpc = jm.MPC(

@@ -590,6 +590,7 @@ class TestFiniteForEveryStatus:
             np.testing.assert_array_equal(a[~nan], b[~nan])
         return kinds, status
 
+    @pytest.mark.long
     def test_float64(self, x64):
         kinds, status = self.check(0, np.float64)
         for kind, expected in (

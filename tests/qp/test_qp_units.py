@@ -169,6 +169,7 @@ def faults(count, each, x64, kinds=KINDS, seed=0):
 
 @pytest.mark.first(1)
 @PRECISIONS
+@pytest.mark.long
 def test_answer_in_any_units(x64):
     assert faults(2, 2, x64) == []
 

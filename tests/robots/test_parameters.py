@@ -78,6 +78,7 @@ def starts(model, rng):
     return x, u
 
 
+@pytest.mark.long
 def test_numbers_act_as_in_c():
     rng = np.random.default_rng(0)
     robot = jm.load_robot(mujoco.MjModel.from_xml_string(PARTS), control_period=0.002)
@@ -124,6 +125,7 @@ def motor():
     return jm.load_robot(mujoco.MjModel.from_xml_string(MOTOR.format("")))
 
 
+@pytest.mark.long
 def test_a_stronger_motor_keeps_the_limit_of_its_joint(motor):
     """The file's limit of the joint is one of inputs, u ≤ 0.5; with twice the gear it binds at
     0.25."""
@@ -208,6 +210,7 @@ def test_variations_of_a_robot_that_was_varied(motor):
         np.testing.assert_array_equal(value[1], heavy.numbers[name])
 
 
+@pytest.mark.long
 def test_lists_are_arrays(motor):
     """Of a plant that varies, of a model's numbers, and of many loops."""
     damping, x, u = [0.3, 0.2], np.array([0.1, 0.2, 0.3, 0.4]), np.ones(1)
@@ -254,6 +257,7 @@ def test_what_does_nothing_is_refused(motor):
             call()
 
 
+@pytest.mark.long
 def test_forces_that_the_file_leaves_out(motor):
     """Dry friction and compensated gravity of a file without, also beside a joint that has some,
     and where friction varies to zero."""

@@ -48,6 +48,7 @@ def assert_close(found, wanted, tolerance=1e-6):
 
 
 @pytest.mark.parametrize("integrator", ["Euler", pytest.param("RK4", marks=pytest.mark.slow)])
+@pytest.mark.long
 def test_springs_at_their_rest(integrator):
     """At home no spring pulls, which MJX takes for no stiffness: of orientations, of tendons, and
     of servos of both. Against mjd_transitionFD, and from a state near by."""

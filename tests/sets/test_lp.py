@@ -103,6 +103,7 @@ def test_a_set_is_unbounded_where_only_rounding_closes_it(spread):
 
 
 @pytest.mark.parametrize("rounding", [0.1 + 0.2 - 0.3, 1e-25, 3e-12, 1e-10])
+@pytest.mark.long
 def test_a_side_that_is_small_beside_others_is_no_unit(rounding):
     """Sets with a row through 0 are those with rounding in its place, or another number far below
     all others, in all that is asked."""

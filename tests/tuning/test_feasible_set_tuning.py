@@ -84,6 +84,7 @@ def test_second_derivatives_by_central_differences():
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5 * np.abs(found).max())
 
 
+@pytest.mark.long
 def test_states_that_are_no_numbers_count_zero_and_spoil_nothing(fraction):
     value, gradient, each = fraction(POINT)
     np.testing.assert_array_equal(each[:4], [0, 0, 0, 1])
