@@ -275,28 +275,37 @@ def unshared(parts: tuple) -> tuple:
 
 
 def harmless(mpc: MPC) -> tuple[MPC, Any]:
-    """Return the problem with harmless dynamics and weights where they are not finite, and whether
-    they are: numbers that are being traced cannot be refused. Others stay as they are, for with
-    known dynamics there are gains and sets that traced ones have not."""
-    fields = ("system", "Q", "R", "terminal_cost", "stage_weights", "input_rate_weight")
-    data = {name: getattr(mpc, name) for name in fields}
-    leaves, tree = jax.tree.flatten(data)
+    """Return the problem with harmless numbers where some that are being traced, and cannot be
+    refused, are not finite, and whether they are. Others stay as they are, for with known dynamics
+    there are gains and sets that traced ones have not.
+
+    (Multiplied by one that is not finite, a derivative of 0 is none, and neither is that by what a
+    batch shares.)
+    """
+    paths, tree = jax.tree.flatten_with_path(mpc)
+    leaves = [leaf for _, leaf in paths]
     traced = [i for i, leaf in enumerate(leaves) if not concrete(leaf)]
     if not traced:
         return mpc, True
-    zeros = jax.tree.map(lambda _: 0.0, data)
-    instead = jax.tree.leaves({**zeros, "R": np.eye(mpc.system.m)})
-    values = [(leaves[i], instead[i]) for i in traced]
-    clean, finite = _harmless(values)
+    clean, finite = _harmless([(paths[i][0][-1].name, leaves[i]) for i in traced])
     for i, leaf in zip(traced, clean, strict=True):
         leaves[i] = leaf
-    return replace(mpc, **jax.tree.unflatten(tree, leaves)), finite
+    return jax.tree.unflatten(tree, leaves), finite
 
 
 @own_modes
-def _harmless(values: list[tuple[Array, Any]]) -> tuple[list[Array], Array]:
-    finite = all_finite([value for value, _ in values])
-    return [jnp.where(finite, value, instead) for value, instead in values], finite
+def _harmless(values: list[tuple[str, Array]]) -> tuple[list[Array], Array]:
+    """Return arrays, given with their names in the problem, as `harmless` does."""
+    # Infinite where there is none.
+    open_ended = ("lower", "upper", "h", "rho", "quadratic", "input_rate_limit")
+    numbers = [jnp.where(jnp.isinf(v), 0, v) if name in open_ended else v for name, v in values]
+    finite, clean = all_finite(numbers), []
+    for name, value in values:
+        instead: Any = 1.0 if name in ("level", "rho") else 0.0
+        if name in ("R", "P"):  # of the cost; of an ellipsoid
+            instead = jnp.eye(value.shape[-1], dtype=value.dtype)
+        clean.append(jnp.where(finite, value, instead))
+    return clean, finite
 
 
 def zeros_of(controller: Callable[[Array], Control[Planned]], x: Array) -> Control[Planned]:

@@ -107,7 +107,8 @@ _SENTENCES = {
         "Make the weights positive semidefinite: check their signs."
     ),
     Status.NON_FINITE: (
-        "The data of this instance hold NaN, or l > u, or an infinite weight, or they overflow in "
-        "their precision: compute in float64, or give an unstable prediction fewer steps."
+        "The data of this instance hold NaN, or l > u (of a limit less what W takes from it, too: "
+        "make W smaller), or an infinite weight, or they overflow in their precision: compute in "
+        "float64, or give an unstable prediction fewer steps."
     ),
 }

@@ -102,8 +102,8 @@ class Forces:
         self.integrators = model.actuator_dyntype == mujoco.mjtDyn.mjDYN_INTEGRATOR
         lower, upper = robot.input_limits.bounds()
         lower[self.integrators], upper[self.integrators] = -np.inf, np.inf
-        bounded = np.flatnonzero(model.actuator_actlimited)
-        low, high = model.actuator_actrange[bounded].T
+        bounded = np.flatnonzero(robot.mujoco.actuator_actlimited)
+        low, high = robot.mujoco.actuator_actrange[bounded].T
         lower[bounded] = np.maximum(lower[bounded], low)
         upper[bounded] = np.minimum(upper[bounded], high)
         self.lower, self.upper, self.m = lower, upper, robot.m

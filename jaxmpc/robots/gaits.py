@@ -175,6 +175,7 @@ def gait(
     require_finite("velocity", velocity)
     require_shape("turn", turn, (), "A number, in rad/s")
     require_finite("turn", turn)
+    _require_same_forces(robot, turn)
     for name, value in (("period", period), ("lift", lift)):
         positive(name, value)
     if not 0 < duty < 1:
@@ -245,6 +246,17 @@ def _require_level_ground(robot: Robot) -> None:
         what = f"stands at the heights {np.round(ground, 4).tolist()} m"
         cure = "Give a home= on flat ground: each foot steps on ground as high as it began on"
         fail("robot", what, cure)
+
+
+def _require_same_forces(robot: Robot, turn: float) -> None:
+    """Raise ValueError where the forces on a trunk that turns depend on its heading: the motion,
+    and models along it, then do not repeat themselves."""
+    options = robot.mujoco.opt
+    for name, acts in (("gravity", options.gravity), ("wind", options.wind)):
+        if turn and np.any(acts[:2]):
+            what = f"is {turn:g} rad/s, and the file's {name} acts along x or y: {acts.tolist()}"
+            cure = "Let turn be 0: models repeat themselves where the heading changes nothing"
+            fail("turn", what, cure)
 
 
 def _require_swings(feet: Sequence[str], standing: np.ndarray, duty: float) -> None:

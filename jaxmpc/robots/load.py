@@ -28,6 +28,7 @@ from jaxmpc.robots.mujoco_access import (
     model_bytes,
     moment_arms,
     mujoco,
+    muscular,
     names,
     number_of,
     single_joints,
@@ -262,7 +263,8 @@ def _periods(
 
 
 def _smooth(host: "mujoco.MjModel") -> "mujoco.MjModel":
-    """Return a copy without contacts, stops, friction and limits of forces."""
+    """Return a copy without contacts, stops, friction and limits of forces and activations: a clamp
+    takes the derivative away where a plan operates, and rows of the problem keep the limits."""
     found = copy.deepcopy(host)
     for kind in ("contact", "limit", "frictionloss") if equalities(host) else ("constraint",):
         found.opt.disableflags |= flag(kind)
@@ -270,6 +272,7 @@ def _smooth(host: "mujoco.MjModel") -> "mujoco.MjModel":
     found.actuator_forcelimited[:] = 0
     found.jnt_actfrclimited[:] = 0
     found.tendon_actfrclimited[:] = 0
+    found.actuator_actlimited[:] = 0
     return found
 
 
@@ -462,6 +465,11 @@ def input_limits(host: "mujoco.MjModel") -> tuple[Box, list[str]]:
     limited = host.actuator_ctrllimited.astype(bool)
     lower[limited], upper[limited] = host.actuator_ctrlrange[limited].T
     sources = ["ctrlrange" if yes else "" for yes in limited]
+    # MuJoCo clamps the excitation of every muscle to [0, 1].
+    for k in np.flatnonzero(muscular(host)):
+        if lower[k] < 0 or upper[k] > 1:
+            sources[k] = "muscle"
+        lower[k], upper[k] = np.clip([lower[k], upper[k]], 0.0, 1.0)
     # Which actuators move a joint, also by tendons and sites, shows where nothing is aligned.
     data, rng = mujoco.MjData(host), np.random.default_rng(0)
     mujoco.mj_integratePos(host, data.qpos, rng.normal(size=host.nv), 1.0)

@@ -74,6 +74,11 @@ def equalities(model: "mujoco.MjModel") -> list[str]:
     return [word(mujoco.mjtEq(int(kind))) for kind in acting]
 
 
+def muscular(model: "mujoco.MjModel") -> np.ndarray:
+    """Return which actuators (nu,) have the activation of muscles."""
+    return model.actuator_dyntype == mujoco.mjtDyn.mjDYN_MUSCLE
+
+
 def single_joints(model: "mujoco.MjModel") -> np.ndarray:
     """Return which joints (njnt,) have one dof: slides and hinges."""
     return np.isin(model.jnt_type, (SLIDE, HINGE))

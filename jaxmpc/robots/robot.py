@@ -36,9 +36,12 @@ from jaxmpc.robots.equilibria import (
     rest_at,
     settled,
 )
-from jaxmpc.robots.mujoco_access import equalities
+from jaxmpc.robots.mujoco_access import equalities, muscular
 from jaxmpc.robots.parameters import require_numbers
 from jaxmpc.systems.system import LinearSystem
+
+# How far from the ends of its range the excitation of a muscle is where it is differentiated.
+_INSIDE = 1e-6
 
 
 @pytree
@@ -101,6 +104,12 @@ class Robot(RobotDescription):
             return after, after
 
         one = jax.jacfwd(step, argnums=(0, 1), has_aux=True)
+        muscles = muscular(self.mujoco)
+        if muscles.any():
+            # MuJoCo clamps the excitation of muscles to [0, 1], and at rest it is 0: the derivative
+            # there is that towards the inside.
+            slopes, inside = one, jnp.where(muscles, jnp.clip(u, _INSIDE, 1 - _INSIDE), u)
+            one = lambda xi, u: (slopes(xi, inside)[0], step(xi, u)[0])
         if exact:
             Chain = tuple[Array, Array, Array]
 
@@ -237,7 +246,7 @@ class Robot(RobotDescription):
         nothing nearby can, home at rest under the input within the limits that leaves the least
         unbalanced force. The affine model has that force in its c: it predicts a fall, and inputs
         still move what they can. Each step down this list gives a UserWarning that names the
-        coordinates.
+        coordinates. Raises ValueError where force limits of servos alone do not hold home.
         """
         if target is not None:
             return self._equilibria("target", target)

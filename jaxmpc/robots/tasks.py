@@ -18,6 +18,8 @@ from jaxmpc.robots.mujoco_access import names, number_of
 from jaxmpc.robots.physics import NO_GRAVITY
 from jaxmpc.robots.robot import Robot
 
+__all__ = ["distance", "energy", "orientation", "position"]
+
 # mjtGeom.
 SPHERE, CAPSULE = 2, 3
 KINDS = ("site", "body", "geom")

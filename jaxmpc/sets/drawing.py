@@ -13,6 +13,8 @@ import scipy
 from jaxmpc.checks import fail
 from jaxmpc.sets.geometry import convex_hull
 
+# Okabe and Ito's palette: distinct with any colour vision.
+COLOURS = "#0072b2", "#d55e00", "#006f52", "#e69f00", "#cc79a7", "#56b4e9", "#000000", "#8a8a8a"
 _MARGIN = 0.08  # of the picture round bounded sets, as a fraction of their size
 _ON = 1e-7  # a corner lies on a row within this fraction of the set's size
 
@@ -42,14 +44,15 @@ def plot(*sets: Any, ax: Any = None, **style: Any) -> Any:
         dims = ", ".join(str(s.dimension) for s in sets)
         fail("sets", f"have dimensions {dims}", "Draw sets of 2 or of 3; `project` or `slice` them")
     if ax is None:
-        _, ax = plt.subplots(subplot_kw={"projection": "3d"} if n == 3 else {})
+        kind = {"projection": "3d"} if n == 3 else {}
+        _, ax = plt.subplots(layout="constrained", subplot_kw=kind)
     if n == 3 and ax.name != "3d":
         fail("ax", "has two dimensions", "Make it by plt.subplots(subplot_kw={'projection': '3d'})")
     view, used = _view(sets, ax), _colors(ax)
     for i, one in enumerate(sets):
         if not one.is_empty():
             own = {key: _own(value, i, len(sets)) for key, value in style.items()}
-            own.setdefault("color", f"C{(used + i) % 10}")
+            own.setdefault("color", COLOURS[(used + i) % len(COLOURS)])
             _draw(ax, one, view, **own)
     for k, (axis, (low, high)) in enumerate(zip("xyz"[:n], view.T, strict=True)):
         if ax.get_autoscale_on():
@@ -57,7 +60,9 @@ def plot(*sets: Any, ax: Any = None, **style: Any) -> Any:
         if not getattr(ax, f"get_{axis}label")():
             getattr(ax, f"set_{axis}label")(f"$x_{k + 1}$")
     if ax.get_legend_handles_labels()[1]:
-        ax.legend()
+        # Beside the sets where the figure makes room for it.
+        room = ax.figure.get_layout_engine() is not None
+        ax.legend(**({"loc": "upper left", "bbox_to_anchor": (1.02, 1.0)} if room else {}))
     return ax
 
 

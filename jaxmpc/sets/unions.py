@@ -73,7 +73,7 @@ class PolytopeUnion:
         """Draw all pieces in one color, as `plot` of a set does; return the axes."""
         if self.is_empty():
             fail("plot", "of an empty union", "Ask is_empty() first")
-        style.setdefault("color", "C0")
+        style.setdefault("color", drawing.COLOURS[0])
         labels = [label, *[None] * (len(self.pieces) - 1)]
         return drawing.plot(*self.pieces, ax=ax, label=labels, **style)
 

@@ -199,6 +199,16 @@ def test_grounds_that_are_not_level_are_refused():
         jm.robots.gait(robot, FEET)
 
 
+@pytest.mark.parametrize("force", ['gravity="1 0 -9.76"', 'wind="0 2 0"'])
+def test_what_pushes_aside_repeats_itself_for_no_heading(force):
+    """A motion that turns is not the same again when its heading is another."""
+    text = QUADRUPED.read_text().replace('integrator="implicitfast"', f'integrator="Euler" {force}')
+    robot = jm.load_robot(mujoco.MjModel.from_xml_string(text))
+    name = force.partition("=")[0]
+    with pytest.raises(ValueError, match=f"turn: is 0.8 rad/s, and the file's {name} acts along"):
+        jm.robots.gait(robot, FEET, (0.3, 0.0), turn=0.8)
+
+
 def test_limits_of_the_caller_are_those_of_joints():
     joints = jm.load_robot(QUADRUPED).home[7:19]
     free = np.full(6, np.inf)

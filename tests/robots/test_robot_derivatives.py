@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from c_engine import by_differences, c_steps, c_transition
+from c_engine import EPS, by_differences, c_steps, c_transition
 from jax.extend.core.primitives import cholesky_p, triangular_solve_p
 from jax.scipy.linalg import cho_factor, cho_solve
 
@@ -44,7 +44,59 @@ def assert_close(found, wanted, tolerance=1e-6):
         np.testing.assert_allclose(a, b, rtol=0, atol=tolerance * size)
 
 
-# --- at rest ---------------------------------------------------------------------------------
+# --- at rest and at limits -------------------------------------------------------------------
+
+PULLED = """<mujoco><option timestep="{timestep}" gravity="0 0 0"/><worldbody><body>
+    <joint name="a" axis="0 1 0" damping=".05"/><geom type="capsule" fromto="0 0 0 0 0 -.3"
+    size=".03" contype="0" conaffinity="0"/></body></worldbody><actuator>{actuators}</actuator>
+    </mujoco>"""
+
+
+def inward(model, x, u, substeps, sides):
+    """Derivatives (n, ...) of a control period of the C engine, by its differences to one side."""
+    point, after = np.concatenate([x, u]), c_steps(model, x, u, substeps)
+    rows = []
+    for side, e in zip(sides, EPS * np.eye(len(point)), strict=True):
+        x_1, u_1 = np.split(point + side * e, [len(x)])
+        rows.append((c_steps(model, x_1, u_1, substeps) - after) / (side * EPS))
+    return np.split(np.transpose(rows), [len(x)], axis=1)
+
+
+@pytest.mark.parametrize("timestep", [0.002, 0.01])
+@pytest.mark.parametrize("u", [(0.0, 0.0), (1.0, 0.3)])
+def test_muscles_at_the_ends_of_their_excitation(x64, timestep, u):
+    """MuJoCo clamps it to [0, 1] in every file, and two that rest have 0: linear models are those
+    of a muscle that begins to pull."""
+    muscle = '<muscle joint="a" gear="{}" lengthrange="-1.5 1.5" force="10"/>'
+    text = PULLED.format(timestep=timestep, actuators=muscle.format(1) + muscle.format(-1))
+    robot = jm.load_robot(mujoco.MjModel.from_xml_string(text), control_period=0.01)
+    for end, wanted in zip(robot.input_limits.bounds(), ([0, 0], [1, 1]), strict=True):
+        np.testing.assert_array_equal(end, wanted)
+    assert [limit[-1] for limit in robot.report().limits[-2:]] == ["file, muscle"] * 2
+    u = np.array(u)
+    x = np.array([0.1, 0.2, *(0.2 * u)])
+    sides = [1.0, 1.0, 1.0, 1.0, *np.where(u == 1, -1.0, 1.0)]
+    A, B = inward(robot.mujoco, x, u, robot.substeps, sides)
+    model = robot.linearize(x, u, exact=True)
+    # At rest A is that of excitations above the activation, too.
+    np.testing.assert_allclose(model.B, B, atol=1e-4 * np.abs(B).max())
+    np.testing.assert_allclose(model.A[:, :2], A[:, :2], atol=1e-4 * np.abs(A).max())
+    np.testing.assert_allclose(
+        model.A @ x + model.B @ u + model.c, c_steps(robot.mujoco, x, u, robot.substeps), atol=1e-9
+    )
+
+
+@pytest.mark.parametrize("at, u", [(0.5, 0.0), (0.5, 0.3), (0.4999, 0.3), (-0.5, -1.0)])
+def test_activations_at_the_ends_of_their_range(x64, at, u):
+    """Rows of the problem keep it; a clamp besides would take the input away."""
+    servo = '<intvelocity joint="a" kp="10" actrange="-.5 .5" ctrlrange="-1 1"/>'
+    text = PULLED.format(timestep=0.01, actuators=servo)
+    robot = jm.load_robot(mujoco.MjModel.from_xml_string(text))
+    x = np.array([0.0, 0.0, at])
+    A, B = inward(robot.mujoco, x * [1, 1, 0.5], [0.0], robot.substeps, np.ones(4))
+    model = robot.linearize(x, [u], exact=True)
+    np.testing.assert_allclose(model.A, A, atol=1e-6)
+    np.testing.assert_allclose(model.B, B, atol=1e-6)
 
 
 @pytest.mark.parametrize("integrator", ["Euler", pytest.param("RK4", marks=pytest.mark.slow)])

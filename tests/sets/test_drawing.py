@@ -9,7 +9,7 @@ import matplotlib.pyplot as plt
 
 import jaxmpc as jm
 from jaxmpc.sets import PolytopeUnion, Zonotope, plot, set_difference
-from jaxmpc.sets.drawing import polygons
+from jaxmpc.sets.drawing import COLOURS, polygons
 
 INF = np.inf
 TRIANGLE = jm.Polytope.from_points([[0, 0], [2, 0], [0, 1]])
@@ -52,7 +52,7 @@ def test_unbounded_sets_are_cut_off_and_named_so():
     corners = ax.patches[0].get_xy()
     assert corners[:, 0].max() == ax.get_xlim()[1] > 2
     # Three edges of the strip, none at the border of the picture.
-    strip = [line for line in ax.lines if line.get_color() == "C0"]
+    strip = [line for line in ax.lines if line.get_color() == COLOURS[0]]
     assert len(strip) == 3 and all(line.get_xdata().min() < 2 for line in strip)
     half = jm.Polytope([[1, 1]], [1]).plot(label="half plane")
     assert [t.get_text() for t in half.get_legend().get_texts()] == ["half plane (unbounded)"]

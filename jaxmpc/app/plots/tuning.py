@@ -13,6 +13,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
 from jaxmpc.app.plots.maps import ring
 from jaxmpc.app.plots.style import AFTER, BEFORE, EDGE, GRID
 from jaxmpc.feasible.map import FeasibleSetMap
+from jaxmpc.sets.drawing import COLOURS
 from jaxmpc.tuning.descent import Descent
 from jaxmpc.tuning.pareto import TradeOff
 from jaxmpc.tuning.result import TuningRun
@@ -24,9 +25,7 @@ FRACTIONS = (
     ("fallback", "plans with slack in soft limits (fallback)", "#e69f00", "-"),
     ("violation", "loops beyond the limits", "#006f52", ":"),
 )
-# Lines of a panel that get a colour and a name each (Okabe and Ito's palette); more are named by
-# the groups they belong to.
-COLOURS = "#0072b2", "#d55e00", "#006f52", "#e69f00", "#cc79a7", "#56b4e9", "#000000", "#8a8a8a"
+# Lines of a panel that get a colour and a name each; more are named by the groups they belong to.
 NAMED = len(COLOURS)
 # Rows of a block.
 DASHES: tuple[Any, ...] = ("-", (0, (4, 2)), (0, (1, 1.5)), (0, (5, 1, 1, 1)))
