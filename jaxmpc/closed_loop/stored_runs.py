@@ -14,8 +14,15 @@ import numpy as np
 
 from jaxmpc.arrays import Reals, numpy_array
 from jaxmpc.batches import Part, Timing, first_rows, padded, work_off
+from jaxmpc.checks import whole
 from jaxmpc.closed_loop.feedback import Feedback
-from jaxmpc.closed_loop.simulation import Run, initial_states, simulate_many
+from jaxmpc.closed_loop.simulation import (
+    Conditions,
+    Run,
+    checked_loop,
+    initial_states,
+    simulate_many,
+)
 from jaxmpc.closed_loop.variations import plant_numbers
 from jaxmpc.files import check_results, fingerprint
 from jaxmpc.pytrees import record
@@ -90,7 +97,8 @@ def simulate_into(
 
     check_results(path, resume, overwrite)
     target = {"reference": reference, "input_reference": input_reference, "devices": devices}
-    loops = _Loops(controller, robot, numpy_array(x0s), int(steps), target, dict(factors or {}))
+    steps = whole("steps", steps, 1)
+    loops = _Loops(controller, robot, numpy_array(x0s), steps, target, dict(factors or {}))
     loops.validate()
     number = Constant(np.arange(len(loops.x0s)), ("sample",), {"long_name": "robot"})
     points = Constant(loops.x0s, ("sample", "state"), {"long_name": "initial state"})
@@ -123,8 +131,10 @@ class _Loops:
     factors: dict[str, np.ndarray]
 
     def validate(self) -> None:
-        """Raise ValueError for starts and factors of other shapes, before there is a store."""
+        """Raise ValueError for what `simulate_many` would refuse, before there is a store."""
         initial_states(self.robot, self.x0s)
+        aims = Conditions(self.target["reference"], self.target["input_reference"])
+        checked_loop(self.controller, self.robot, self.x0s[0], self.steps, aims)
         if self.factors:
             numbers = plant_numbers(self.robot, self.factors)
             require_numbers(self.robot.plant, numbers, (len(self.x0s),))

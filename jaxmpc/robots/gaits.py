@@ -178,6 +178,7 @@ def gait(
     _require_same_forces(robot, turn)
     for name, value in (("period", period), ("lift", lift)):
         positive(name, value)
+    require_shape("duty", duty, (), "One number for all feet")
     if not 0 < duty < 1:
         fail("duty", f"{duty}", "Give a part of the period in (0, 1)")
     count = round(period / robot.dt)

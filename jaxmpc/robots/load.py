@@ -346,6 +346,7 @@ def _home(host: "mujoco.MjModel", home: Reals | None) -> tuple[np.ndarray, np.nd
             fail(
                 "model", f"its {source.removeprefix('file, ')} holds NaN", "Give home=, or mend it"
             )
+        source += ", at rest" if np.any(host.key_qvel[key]) else ""
     else:
         ranged = host.jnt_limited.astype(bool) & single_joints(host)
         at = host.jnt_qposadr[ranged]

@@ -59,6 +59,7 @@ class Physics:
         self.own: dict[str, tuple[int, ...]] = {PAYLOAD: ()}  # shapes of numbers beside mjx.Model's
         self.joints = tuple(int(joint) for joint in model.jnt_type)
         self.tree = Tree.of(model)
+        self.filled = _filled(model)
         try:
             # Also where a program that needs it is being traced, see `acting`.
             outside = jax.ensure_compile_time_eval()
@@ -231,7 +232,7 @@ class Physics:
 
     def _added(self, model: Any, data: Any, damped: bool) -> Array:
         """Return what tendons with inertia add to M (nv, nv), and damped: what the integrator does,
-        as in mjx.euler and mjx.implicit."""
+        as in mjx.euler and mjx.implicit, but for what couples branches, which MuJoCo leaves out."""
         J, h = data._impl.ten_J, model.opt.timestep
         added = matmul(J.T * model.tendon_armature, J)
         if damped and self.model.opt.integrator == EULER:
@@ -240,7 +241,7 @@ class Physics:
         elif damped:
             slope = mjx_module().deriv_smooth_vel(_without_saturated(model, data), data)
             added = added if slope is None else added - h * slope
-        return added
+        return jnp.where(self.filled, added, 0)
 
     def _forced(
         self, numbers: dict[str, Array], q: Array, v: Array, act: Array, u: Array
@@ -418,6 +419,16 @@ def _widest(tree: Any) -> Any:
     wide = jnp.result_type(float)
     number = lambda v: v.astype(wide) if jnp.issubdtype(v.dtype, jnp.floating) else v
     return jax.tree.map(lambda v: number(jnp.asarray(v)), tree)
+
+
+def _filled(model: "mujoco.MjModel") -> np.ndarray:
+    """Return which entries (nv, nv) MuJoCo's M has, those of two dofs on one branch of the tree of
+    bodies: what is added to M is added to these alone."""
+    found = np.zeros((model.nv, model.nv), bool)
+    for i, (start, size) in enumerate(zip(model.M_rowadr, model.M_rownnz, strict=True)):
+        columns = model.M_colind[start : start + size]
+        found[i, columns] = found[columns, i] = True
+    return found
 
 
 def _next_activations(model: Any, data: Any) -> Array:

@@ -249,6 +249,8 @@ class Robot(RobotDescription):
         coordinates. Raises ValueError where force limits of servos alone do not hold home.
         """
         if target is not None:
+            nq = (self.mujoco.nq,)
+            require_shape("target", target, nq, "One configuration; `equilibrium` takes many")
             return self._equilibria("target", target)
         rest, texts = settled(self)
         for text in texts:

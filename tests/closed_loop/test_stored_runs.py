@@ -168,4 +168,10 @@ def test_wrong_arguments_leave_no_store(tmp_path, joint, feedback):
     ):
         with pytest.raises(ValueError, match=message):
             simulate_into(tmp_path / "runs.zarr", feedback, joint, x0s, 3, factors=factors)
+    start = np.zeros((2, 2))
+    for steps in (0, 3.7, True, "3", np.nan, None):
+        with pytest.raises(ValueError, match=f"steps: {steps!r}. Give a whole number"):
+            simulate_into(tmp_path / "runs.zarr", feedback, joint, start, steps)
+    with pytest.raises(ValueError, match=r"reference: shape \(3,\)"):
+        simulate_into(tmp_path / "runs.zarr", feedback, joint, start, 3, reference=np.zeros(3))
     assert not any(tmp_path.iterdir())

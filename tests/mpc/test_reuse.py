@@ -162,6 +162,7 @@ def test_all_states_alike(mpc, few):
     np.testing.assert_allclose(found.inputs, found.inputs[:1].repeat(COUNT, 0), atol=1e-7)
 
 
+@pytest.mark.long
 def test_it_is_given_up_where_few_follow(mpc, states, solved, few, monkeypatch):
     monkeypatch.setattr(many, "TRIAL_CHUNKS", 1)
     monkeypatch.setattr(many, "LEAST_FOLLOWED", 1.1)

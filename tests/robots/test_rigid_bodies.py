@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from c_engine import c_steps
+from c_engine import c_steps, c_transition
 
 import jaxmpc as jm
 from jaxmpc.robots import rigid_bodies
@@ -67,7 +67,6 @@ TENDONS = """<tendon>
   <spatial name="rope"><site site="arm"/><site site="side"/><site site="nose"/></spatial>
 </tendon>"""
 
-# MuJoCo's own implicit steps leave out what couples branches; this one is on one branch.
 LINE = """<tendon>
   <spatial name="line" armature=".7" stiffness="30" damping="3">
     <site site="post"/><site site="hand"/></spatial>
@@ -229,3 +228,25 @@ def test_every_number_that_varies_counts():
         found = jax.jit(jax.vmap(partial(Physics(model).step, x, u)))(rows)
     for name, ours, theirs in zip(names, found, wanted, strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-8, err_msg=name)
+
+
+@pytest.mark.parametrize(
+    "integrator, tendon",
+    [("Euler", 'armature=".3"'), ("implicitfast", 'armature=".2" damping="3"')],
+)
+def test_tendons_that_couple_branches(x64, integrator, tendon):
+    """A gripper: MuJoCo adds to M where it has entries, none of two fingers."""
+    finger = """<body pos="0 {0}.1 0"><joint name="{1}" type="slide" axis="0 {0}1 0"/>
+        <geom size=".02" mass="{2}" contype="0" conaffinity="0"/></body>"""
+    model = mujoco.MjModel.from_xml_string(f"""<mujoco>
+        <option timestep="0.005" integrator="{integrator}"/><worldbody>
+        {finger.format("", "left", 0.1)}{finger.format("-", "right", 0.2)}</worldbody>
+        <tendon><fixed name="split" {tendon}><joint joint="left" coef=".5"/>
+        <joint joint="right" coef=".5"/></fixed></tendon>
+        <actuator><general tendon="split" gainprm="100" biastype="affine" biasprm="0 -100 -10"
+        ctrlrange="0 1"/></actuator></mujoco>""")
+    robot = jm.load_robot(model)
+    x, u = np.array([0.02, -0.01, 0.3, -0.1]), np.array([0.4])
+    np.testing.assert_allclose(robot.plant.step(x, u), c_steps(model, x, u, 1), atol=1e-14)
+    for found, wanted in zip(robot.transition(x, u), c_transition(robot, x, u), strict=True):
+        np.testing.assert_allclose(found, wanted, atol=1e-7)
