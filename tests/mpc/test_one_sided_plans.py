@@ -146,6 +146,7 @@ def test_plans_that_dose_nothing(solve, n, m, unit, most):
 
 @pytest.mark.parametrize("name", ["states", "inputs", "terminal_set"])
 @pytest.mark.long
+@pytest.mark.first(1)
 def test_a_polytope_without_rows_limits_nothing(name):
     size = {"inputs": 1}.get(name, 2)
     everything = jm.Box([-np.inf] * size, [np.inf] * size).to_polytope()

@@ -306,7 +306,7 @@ def test_forms_of_one_set_of_disturbances():
     np.testing.assert_allclose(each[2], each[0], atol=1e-8)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_traced_limits_of_a_tube():
     """Under jit the same plan, and derivatives by differences; the LQR of traced weights is refused
     with what helps."""

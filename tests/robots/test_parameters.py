@@ -257,7 +257,7 @@ def test_what_does_nothing_is_refused(motor):
             call()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_forces_that_the_file_leaves_out(motor):
     """Dry friction and compensated gravity of a file without, also beside a joint that has some,
     and where friction varies to zero."""

@@ -56,6 +56,7 @@ def test_points_in_a_hyperplane_have_no_volume():
 
 @pytest.mark.parametrize("far", [10.0, 100.0, 1e3, 1e4])
 @pytest.mark.long
+@pytest.mark.first(2)
 def test_flat_images_far_out_keep_their_dimensions(far):
     """The same output in two units beside another one, of polygons far from the origin: a plane
     through 0, of which hulls know the slopes to rounding times the distance alone."""
