@@ -131,7 +131,8 @@ class _Loops:
     factors: dict[str, np.ndarray]
 
     def validate(self) -> None:
-        """Raise ValueError for what `simulate_many` would refuse, before there is a store."""
+        """Raise ValueError for starts, steps, aims and factors that `simulate_many` refuses, before
+        there is a store."""
         initial_states(self.robot, self.x0s)
         aims = Conditions(self.target["reference"], self.target["input_reference"])
         checked_loop(self.controller, self.robot, self.x0s[0], self.steps, aims)

@@ -279,8 +279,8 @@ def harmless(mpc: MPC) -> tuple[MPC, Any]:
     refused, are not finite, and whether they are. Others stay as they are, for with known dynamics
     there are gains and sets that traced ones have not.
 
-    (Multiplied by one that is not finite, a derivative of 0 is none, and neither is that by what a
-    batch shares.)
+    An instance that is not solved has the derivative 0, and 0 times NaN is NaN: what is shared with
+    the other instances of a batch would have no derivative either.
     """
     paths, tree = jax.tree.flatten_with_path(mpc)
     leaves = [leaf for _, leaf in paths]

@@ -1,12 +1,12 @@
 """A robot of MuJoCo as a plant: one control period forward, and its affine models.
 
 A file gives two models. The plant is the model as written, except that the force limits of motors
-become `input_limits`. The predictor is the same without limits of joints and of forces, contacts
-and friction loss: a stiff spring at a joint's end makes a linear model useless one sample later, so
-limits belong into the MPC. Couplings (equalities) are in both; feet that stand are held in the
-predictor by forces of their own (`contacts.py`). Both apply inputs without MuJoCo's
-clamp to `ctrlrange`, whose derivative is wrong at the bound, where MPC often operates: the
-controller has to keep u inside `input_limits`.
+become `input_limits`. The predictor is the same without limits of joints, forces and activations,
+contacts and friction loss: a stiff spring at a joint's end makes a linear model useless one sample
+later, so limits belong into the MPC. Couplings (equalities) are in both; feet that stand are held
+in the predictor by forces of their own (`contacts.py`). Both apply inputs without MuJoCo's clamp to
+`ctrlrange`, whose derivative is wrong at the bound, where MPC often operates: the controller has to
+keep u inside `input_limits`.
 """
 
 import warnings
