@@ -69,6 +69,7 @@ from jaxmpc.qp.admm import ADMM, DEFAULT, default_rho, scaled_multipliers
 from jaxmpc.qp.jax_transformations import Undo, implicit, own_modes, repeat_while, varying
 from jaxmpc.qp.linalg import apply, arrays, cholesky, precisely, rounding
 from jaxmpc.qp.newton import Constants
+from jaxmpc.qp.problem import Bounds
 from jaxmpc.qp.residuals import SHARE, Measured, Proof, Terms, assess
 from jaxmpc.qp.solve import tolerance
 from jaxmpc.qp.status import Status
@@ -212,8 +213,16 @@ def _solve(
         step = partial(sqp_step, iterations, hessian)
         last = repeat_while(lambda state: state.open, step, constants, first, steps="recursion")
         x, u, y, count = last.x, last.u, last.y, last.steps
+    constant = jax.lax.stop_gradient
+    about = constant(expanded(base, problem, x, u))
+    # What has no finite expansion has the derivative 0: as NaN it would be the whole batch's.
+    out = about.bounds.outside(about.rows(x, u))
+    finite = usable & all_finite(replace(about, bounds=Bounds(out, out)))
+    base, problem, aim, x, u, y = jax.tree.map(
+        lambda v: jnp.where(finite, v, constant(v)), (base, problem, aim, x, u, y)
+    )
     s = expanded(base, problem, x, u)
-    measured, E = jax.lax.stop_gradient(scaled(s, scale))
+    measured, E = constant(scaled(s, scale))
     rho, s = penalty(s, E), replace(s, gain=measured.gain)
     # Where the expansion overflows nothing is solved, and what is applied is a number still.
     or_start = lambda planned, u=u: jnp.where(jnp.isfinite(planned), planned, u)
