@@ -352,7 +352,7 @@ def followed(robot, kinds, seed=0, **numbers):
     return observer.split(np.asarray(mean))[1]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_numbers_of_a_robot_are_estimated(loaded):
     """A payload, the damping of a joint and the strength of a motor, each alone and together."""
     gear = np.eye(6, 1)
@@ -458,7 +458,7 @@ def test_loads_are_held_by_motors_of_any_size():
     np.testing.assert_allclose(held, J.T @ [0, 0, 5 * 9.81], rtol=1e-3, atol=1e-4)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("linearize", ["state", "trajectory", None])
 def test_plans_know_the_estimated_payload(loaded, linearize):
     """The rod hangs where its reference is, and is held there: with a load that nobody knows below
@@ -489,7 +489,7 @@ def test_plans_know_the_estimated_payload(loaded, linearize):
     np.testing.assert_allclose(x, [1.0, 0.0], atol=2e-3)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_covariance_of_numbers_is_that_of_the_linear_model(loaded):
     """By differences of the prediction, about numbers that are not the file's."""
     model = RobotModel(loaded, numbers={"payload": 0.2})

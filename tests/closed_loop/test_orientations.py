@@ -74,7 +74,11 @@ def controllers(robot):
 
 @pytest.mark.parametrize(
     "kind",
-    ["law", *(pytest.param(kind, marks=pytest.mark.long) for kind in KINDS)],
+    [
+        "law",
+        *(pytest.param(kind, marks=pytest.mark.long) for kind in KINDS[:3]),
+        pytest.param("nonlinear", marks=pytest.mark.slow),
+    ],
 )
 def test_loops_take_the_shorter_way(satellite, kind):
     """From −3 to 3 rad it is 0.28 rad the shorter way, and 6 the longer."""

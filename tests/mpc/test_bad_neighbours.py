@@ -49,17 +49,18 @@ PROBLEMS = {
     "dense": (jm.solve, DENSE),
     "prestabilised": (jm.solve, replace(NOMINAL, prestabilise=GAIN)),
     "stages": (jm.mpc.solve_stagewise, replace(NOMINAL, soft=SOFT)),
+    "tightened": (jm.solve, ROBUST),
+    "affine": (jm.solve, AFFINE),
+    "tube": (jm.solve, TUBE),
     "nonlinear": (
         jm.mpc.solve_nonlinear,
         jm.mpc.NonlinearMPC(replace(NOMINAL, soft=SOFT), Pendulum(1.2), (TASK,)),
     ),
-    "tightened": (jm.solve, ROBUST),
-    "affine": (jm.solve, AFFINE),
-    "tube": (jm.solve, TUBE),
 }
 
 
 @pytest.mark.long
+@pytest.mark.first(6)
 @pytest.mark.parametrize("kind", PROBLEMS)
 def test_the_derivative_by_what_a_batch_shares(x64, kind):
     """Each instance but the first has NaN in another array of its problem; all are multiplied by

@@ -553,7 +553,7 @@ def unstable(as_function, A, B, x):
     return plan.inputs[0, 0], plan
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_unstable_models_are_solved_as_linear_ones_are(x64):
     """Models that grow 3e3- to 1e12-fold over the horizon; those of 1e6 and more were solved
     nowhere."""

@@ -207,7 +207,8 @@ def test_rates_in_the_state(few):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("rates", [False, True])
+@pytest.mark.first(1)
+@pytest.mark.parametrize("rates", [True, False])
 def test_references_of_all_plans(few, rates):
     """Solved and followed plans are those of `solve`, for a target and a trajectory."""
     mpc, random = problems.joint_o_inf(4), np.random.default_rng(0)

@@ -386,7 +386,7 @@ def test_multipliers_of_rows_that_no_input_moves_have_derivatives(solver):
     np.testing.assert_allclose(found[1], [4, -4, 1, 1], rtol=1e-12)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_what_is_solved_costs_what_the_plan_costs_however_unstable_the_model():
     """A² … A²⁰ grow by 2.8 a step, and with them the parts of a gradient whose sum is zero: a gap
     of 1 % of the cost was small beside them, and the plan called solved."""
@@ -412,7 +412,7 @@ def test_what_is_solved_costs_what_the_plan_costs_however_unstable_the_model():
     assert few.status == jm.Status.ITERATION_LIMIT
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_unstable_systems_are_solved_where_the_condensed_program_is():
     """Systems that grow 3e3- to 1e12-fold over the horizon in open loop, also in coordinates that
     nearly coincide, where the plan is a difference of large terms."""

@@ -58,7 +58,7 @@ def standing():
     return hopper().standing(["foot"], friction=0.5)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_contact_forces_of_numbers_that_vary(standing):
     """Compensated gravity, which the file leaves out, takes the load off the foot."""
     x, u = standing.equilibrium()

@@ -224,7 +224,7 @@ def test_motions_keep_the_velocity_limits():
         jm.robots.gait(robot, FEET, (0.5, 0.0))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_servos_keep_their_force_limits():
     """`forcerange` is a row of the plans; at the first stage the input is within it."""
     servo = r'<position name="\1" joint="\1" kp="200" kv="1" ctrlrange="-4 4" forcerange="-30 30"/>'

@@ -143,7 +143,7 @@ def test_a_stronger_motor_keeps_the_limit_of_its_joint(motor):
         np.testing.assert_allclose(row, c_steps(stronger, x, u, motor.substeps), atol=1e-12)
 
 
-@pytest.mark.parametrize("name", [pytest.param("arm2", marks=pytest.mark.long), "sphere"])
+@pytest.mark.parametrize("name", [pytest.param("arm2", marks=pytest.mark.slow), "sphere"])
 def test_derivative_by_a_payload(name, motor):
     """Also where the body or the loaded body is as a ball, whose principal axes have no
     derivative."""
@@ -210,7 +210,7 @@ def test_variations_of_a_robot_that_was_varied(motor):
         np.testing.assert_array_equal(value[1], heavy.numbers[name])
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_lists_are_arrays(motor):
     """Of a plant that varies, of a model's numbers, and of many loops."""
     damping, x, u = [0.3, 0.2], np.array([0.1, 0.2, 0.3, 0.4]), np.ones(1)

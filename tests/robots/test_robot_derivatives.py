@@ -100,7 +100,7 @@ def test_activations_at_the_ends_of_their_range(x64, at, u):
 
 
 @pytest.mark.parametrize("integrator", ["Euler", pytest.param("RK4", marks=pytest.mark.slow)])
-@pytest.mark.long
+@pytest.mark.slow
 def test_springs_at_their_rest(integrator):
     """At home no spring pulls, which MJX takes for no stiffness: of orientations, of tendons, and
     of servos of both. Against mjd_transitionFD, and from a state near by."""
