@@ -53,10 +53,10 @@ def test_matrices_are_dense():
 W = jm.Box([-0.1, -0.1], [0.1, 0.1])
 STEPS = jm.LinearSystem(np.stack([DOUBLE.A] * 3), np.stack([DOUBLE.B] * 3))
 REFUSED = {
-    "`offline_report` says so where a problem has outputs, rates or blocked moves": [
+    "where a problem has outputs that depend on inputs, rates or blocked moves": [
         lambda: theorems(problem(input_rate_limit=0.5)),
         lambda: theorems(problem(control_horizon=2)),
-        lambda: theorems(problem(outputs=jm.Outputs([[1.0, 0.0]], upper=4.0))),
+        lambda: theorems(problem(outputs=jm.Outputs([[1.0, 0.0]], upper=4.0, D=[[1.0]]))),
     ],
     "Explicit laws and `OffsetFreeController` are those of `policy=": [
         lambda: jm.explicit.critical_regions(problem(disturbance=W, policy="affine")),

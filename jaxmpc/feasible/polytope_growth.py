@@ -19,7 +19,7 @@ from jaxmpc.feasible.plan_polytope import (
 )
 from jaxmpc.feasible.policy_problem import MORE_ROOM, NO_VOLUME, problem_of
 from jaxmpc.mpc.plan import rate_ends
-from jaxmpc.mpc.problem import HARD, MPC, RELAX
+from jaxmpc.mpc.problem import HARD, MPC, RELAX, folded
 from jaxmpc.pytrees import record
 from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope
 from jaxmpc.sets.disturbances import disturbance_columns
@@ -96,6 +96,7 @@ def any_policy_polytope(mpc: MPC) -> Polytope:
     require_kind("mpc", mpc, MPC)
     mpc.validate()
     mpc.require_constant("steps back from the terminal set are all the same", *HARD)
+    mpc = folded(mpc)
     if mpc.states is None:
         fail("states", "is None, and the steps back begin with their limits", "Give limits")
     for name, given, usual in (
@@ -105,6 +106,8 @@ def any_policy_polytope(mpc: MPC) -> Polytope:
     ):
         if given:
             what = "is given, and the steps back have limits of states, inputs and rates alone"
+            if name == "outputs":
+                what = "is given with D, or for stages of its own, and the steps back take neither"
             fail(name, what, f"Ask about dataclasses.replace(mpc, {name}={usual})")
     if isinstance(mpc.terminal_set, Ellipsoid):
         fail("terminal_set", "is an Ellipsoid, which has no facets", "Give a Polytope")

@@ -798,6 +798,36 @@ def output_stages(mpc: MPC, rows: Outputs) -> tuple[int, ...]:
     return tuple(k for k in mpc.state_stages if k < mpc.horizon or rows.D is None)
 
 
+def within_outputs(
+    states: Box | Polytope | None, outputs: Outputs | Sequence[Outputs], K: Reals | None = None
+) -> Box | Polytope | None:
+    """Return the states within their limits whose outputs are within theirs, C x, and with K (m, n)
+    those under u = K x, C x + D u. Rows that are given for single stages, or that differ from
+    stage to stage, are left out. NumPy in float64; not traceable."""
+    for rows in as_tuple("outputs", outputs, Outputs):
+        if rows.stages is None and not differing(rows):
+            C = host_array("C", rows.C)
+            if rows.D is not None and K is not None:
+                C = C + host_array("D", rows.D) @ host_array("K", K)
+            lower, upper = rows.sides
+            allowed = output_limits(C, lower, upper, rows.names, rows.units)
+            both: Any = allowed if states is None else states.intersect(allowed)
+            states = both
+    return states
+
+
+def folded(mpc: MPC) -> MPC:
+    """Return the same problem, where limits of outputs that are functions of the state at the
+    stages of its limits are among these."""
+    outputs = as_tuple("outputs", mpc.outputs, Outputs)
+    state = lambda rows: rows.stages is None and rows.D is None and not differing(rows)
+    if not concrete((mpc.states, outputs)) or differing(mpc.states):
+        return mpc
+    of_states = [rows for rows in outputs if state(rows)]
+    rest = tuple(rows for rows in outputs if not state(rows))
+    return replace(mpc, states=within_outputs(mpc.states, of_states), outputs=rest)
+
+
 def as_tuple(name: str, value: Any, kind: type) -> tuple:
     """One or several as a tuple; ValueError for anything else."""
     value = (value,) if isinstance(value, kind) else value

@@ -27,7 +27,7 @@ from jaxmpc.feasible.plan_polytope import CenteredPolytope
 from jaxmpc.feasible.policy_problem import problem_of
 from jaxmpc.grids import grid
 from jaxmpc.mpc.plan import References, constant_references
-from jaxmpc.mpc.problem import HARD, MPC
+from jaxmpc.mpc.problem import HARD, MPC, folded
 from jaxmpc.recursion.counterexamples import (
     STARTS,
     Counterexample,
@@ -132,7 +132,9 @@ def examine(
     """Return the report of `recursive_feasibility`; settled: when its stage 1 has to end.
     references: what plans track, by argument."""
     require_kind("mpc", mpc, MPC)
+    mpc.validate()
     mpc.require_constant(SAME, *HARD)
+    mpc = folded(mpc)
     require_kind("search", search, bool, cure="Give True or False")
     problem = problem_of(mpc)
     p = problem.dimension
@@ -327,6 +329,7 @@ def smallest_horizon(
     require_kind("mpc", mpc, MPC)
     mpc.validate()
     mpc.require_constant(SAME, *HARD)
+    mpc = folded(mpc)
     references = constant_references(mpc, reference, input_reference)
     max_horizon = whole("max_horizon", max_horizon, 1)
     max_regions = whole("max_regions", max_regions, 0)

@@ -31,7 +31,9 @@ _REDUNDANT = 1e-12
 # more than the rounding of its rows, which would make most sets leave themselves by it.
 _DRAWN_IN = 1e-14
 # Names of terminal sets.
-TERMINAL_SETS = ("none", "box", "invariant", "ellipsoid")
+# Those of a law: within the limits under it.
+OF_A_LAW = ("invariant", "ellipsoid")
+TERMINAL_SETS = ("none", "box", *OF_A_LAW)
 
 
 @pytree

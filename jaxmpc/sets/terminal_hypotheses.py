@@ -87,14 +87,13 @@ class TerminalReport:
 
     def __repr__(self) -> str:
         """Return what the checks say of each theorem."""
-        lines = []
+        lines = ["With limits of states and inputs alone, none of rates or outputs, moves free:"]
         for number, title in ((1, "recursive feasibility"), (3, "asymptotic stability")):
             missing = [c.name for c in self.checks if number in c.theorems and not c.holds]
             answer = f"does not apply: {', '.join(missing)}" if missing else "applies"
             lines.append(f"Theorem {number} ({title}) {answer}.")
         if self.disturbed:
             lines.append("Theorem 3 is about w = 0: under the disturbance x need not converge.")
-        lines.append("Limits of input rates, outputs and blocked moves are no part of either.")
         return "\n".join(lines)
 
     def __str__(self) -> str:

@@ -387,21 +387,17 @@ def initial_range(
     limits: tuple[np.ndarray, np.ndarray],
     lower: Sequence[float] | None = None,
     upper: Sequence[float] | None = None,
-    spread: float = 1.0,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the ends (n,) of the initial states: as given, else this fraction of the limits (n,)
-    about their middle. Raises ValueError where they are not finite, or lower not below upper."""
+    """Return the ends (n,) of the initial states: as given, else the limits (n,). Raises ValueError
+    where they are not finite, or lower not below upper."""
     low, high = limits
     for name, given in (("lower", lower), ("upper", upper)):
         if given is not None and len(given) != len(low):
             fail(name, f"has {len(given)} numbers", f"The problem has {len(low)} states")
         if given is not None:
             require_finite(name, np.asarray(given, float))
-    bounded = np.isfinite(low) & np.isfinite(high)
-    low, high = np.where(bounded, low, np.nan), np.where(bounded, high, np.nan)
-    middle, half = (high + low) / 2, (high - low) / 2
-    low = middle - spread * half if lower is None else np.asarray(lower, float)
-    high = middle + spread * half if upper is None else np.asarray(upper, float)
+    low = low if lower is None else np.asarray(lower, float)
+    high = high if upper is None else np.asarray(upper, float)
     if not np.all(np.isfinite([low, high])):
         fail("lower, upper", "the state limits do not bound all states", "Give both ends")
     if np.any(low >= high):
@@ -438,5 +434,5 @@ def feasible_states(
         found.append(x)
         if len(found) == count:
             return np.array(found), without_plan
-    cure = "Draw from a smaller region: spread, lower, upper"
+    cure = "Draw from where plans exist: lower, upper, or a smaller spread around the target"
     fail("initial states", f"{len(found)} of {TRIES * count} drawn have a plan", cure)

@@ -9,11 +9,11 @@ from jaxmpc.arrays import Reals
 from jaxmpc.checks import fail, nearest, require_kind
 from jaxmpc.explicit.exact_penalties import ExactPenalty, exact_penalty
 from jaxmpc.mpc.controller import Controller
-from jaxmpc.mpc.problem import MPC, soften
+from jaxmpc.mpc.problem import MPC, soften, within_outputs
 from jaxmpc.pytrees import record
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope
-from jaxmpc.sets.invariant import named_terminal_set
+from jaxmpc.sets.invariant import OF_A_LAW, named_terminal_set
 from jaxmpc.sets.limits import JointLimits
 from jaxmpc.systems.riccati import LQR, lqr
 from jaxmpc.systems.system import LinearSystem
@@ -58,7 +58,8 @@ def design(
 
     Arguments:
         limits: those of `joint_limits`; or give states and inputs themselves.
-        terminal: a set, or the name of one as in `named_terminal_set`.
+        terminal: a set, or the name of one as in `named_terminal_set`, of whose law the outputs are
+            within their limits too.
         soft: None keeps all limits hard; a number is the L1 weight of state and terminal rows;
             "exact" computes the least weight that changes nothing on the feasible set, and adds a
             margin.
@@ -83,15 +84,17 @@ def design(
             named: dict[str, Any] = limits.names
             system = replace(system, **named)
     regulator = lqr(system, Q, R)
+    settings = {"terminal_cost": regulator.P, **settings}
+    mpc = MPC(system, Q, R, horizon, states, inputs, **settings)
+    mpc.validate()
+    last: Any = terminal
     if isinstance(terminal, str):
         against = (settings.get(name) for name in ("disturbance", "disturbance_matrix"))
         gain = settings.get("gain")
         law = regulator if gain is None else LQR(K=gain, P=regulator.P)
-        last = named_terminal_set(terminal, system, law, states, inputs, *against)
-    else:
-        last = terminal
-    settings = {"terminal_cost": regulator.P, **settings}
-    mpc = MPC(system, Q, R, horizon, states, inputs, terminal_set=last, **settings)
+        kept = within_outputs(states, mpc.outputs, law.K) if terminal in OF_A_LAW else states
+        last = named_terminal_set(terminal, system, law, kept, inputs, *against)
+    mpc = replace(mpc, terminal_set=last)
     mpc.validate()
     if soft is None:
         return Design(mpc, regulator, None)

@@ -23,7 +23,7 @@ from jaxmpc.mpc.condense import in_float64
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.plan import References, checked_aim
 from jaxmpc.mpc.policy_rows import condensed_plan
-from jaxmpc.mpc.problem import HARD, MPC, harden
+from jaxmpc.mpc.problem import HARD, MPC, folded, harden
 from jaxmpc.mpc.rows import given_blocks, row_table
 from jaxmpc.mpc.tightening import feedback_gain
 from jaxmpc.pytrees import record
@@ -333,6 +333,7 @@ def mapped(problem: FeasibilityProblem, x0s: Reals | None, budget: Budget) -> Fe
 
 def theorems(mpc: MPC, K: Reals | None = None) -> TerminalReport:
     """Return the `verify_terminal` report of a problem; ValueError where no theorem covers it."""
+    mpc = folded(mpc)
     if not is_standard_form(mpc) or (mpc.terminal_set is None and mpc.horizon == 1):
         cure = (
             "They cover limits of states and inputs alone, at the usual steps, inputs free at each"

@@ -18,6 +18,10 @@ from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 
 
+UNEVEN = "x_min = [-9.0, -1.0]\nx_max = [1.0, 5.0]"
+AIM = "[reference]\nstate = [1.0, 3.0]\n"
+
+
 @pytest.fixture
 def write(tmp_path):
     """Write MINIMAL_FILE with one piece of text replaced (and more appended); give the path."""
@@ -84,6 +88,24 @@ def test_overrides_win_over_the_file(write):
     assert (config.mpc.horizon, config.mpc.terminal, config.sweep.grid) == (7, "box", (5, 6))
     mpc = config.build_mpc()
     assert mpc.terminal_set is mpc.states
+
+
+def test_starts_are_around_the_target_not_the_middle_of_the_limits(write):
+    """As in deviations from an operating point, where limits lie unevenly about 0."""
+    config = load(write("x_min = [-5.0, -5.0]\nx_max = [5.0, 5.0]", UNEVEN))
+    np.testing.assert_allclose(config.around_target(0.1), [[-0.9, -0.1], [0.1, 0.5]])
+    np.testing.assert_allclose(config.around_target(1.0), config.state_range())
+    aimed = load(write("x_min = [-5.0, -5.0]\nx_max = [5.0, 5.0]", UNEVEN, AIM))
+    np.testing.assert_allclose(aimed.around_target(0.5), [[-4.0, 1.0], [1.0, 4.0]])
+
+
+def test_files_with_outputs_have_terminal_sets_within_them(write):
+    rows = "[[outputs]]\nC = [[0.0, 1.0]]\nlower = -0.2\nupper = 0.2\n"
+    farthest = []
+    for more in ("", rows):
+        mpc = load(write("horizon", 'terminal = "invariant"\nhorizon', more)).build_mpc()
+        farthest.append(float(mpc.terminal_set.support(np.array([[0.0, 1.0]]))[0]))
+    assert farthest[0] > 0.3 and farthest[1] == pytest.approx(0.2)
 
 
 def test_polytope_limits_bound_the_grid(write):

@@ -214,7 +214,7 @@ def test_the_double_integrator_of_the_literature():
     any_policy = any_policy_polytope(mpc)
     np.testing.assert_allclose(any_policy.volume(), exact.volume(), rtol=1e-12)
     for name, value in (
-        ("outputs", jm.mpc.Outputs([[1.0, 1.0]], upper=[5.0])),
+        ("outputs", jm.mpc.Outputs([[1.0, 1.0]], upper=[5.0], D=[[1.0]])),
         ("constrained_stages", (1, 2)),
         ("constrain_initial", False),
         ("states", None),

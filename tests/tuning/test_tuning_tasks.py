@@ -65,8 +65,8 @@ def test_initial_states_lie_in_the_range():
     limits = np.array([-1.0, -np.inf]), np.array([3.0, np.inf])
     with pytest.raises(ValueError, match="lower, upper: the state limits do not bound"):
         initial_range(limits)
-    low, high = initial_range((limits[0][:1], limits[1][:1]), spread=0.5)
-    assert low == 0 and high == 2
+    low, high = initial_range((limits[0][:1], limits[1][:1]))
+    assert low == -1 and high == 3
     with pytest.raises(ValueError, match="lower: has 2 numbers"):
         initial_range((limits[0][:1], limits[1][:1]), lower=(0.0, 1.0))
 

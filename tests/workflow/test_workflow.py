@@ -12,7 +12,7 @@ import jaxmpc as jm
 from jaxmpc.app.cli import main
 from jaxmpc.feasible.map import map_points
 from jaxmpc.feasible.problem import FeasibilityProblem
-from jaxmpc.workflow.offline_checks import SetPoint, nominal_loops
+from jaxmpc.workflow.offline_checks import SetPoint, nominal_loops, theorems
 
 
 def test_design_builds_what_its_parts_say():
@@ -38,6 +38,44 @@ def test_design_builds_what_its_parts_say():
     )  # fmt: skip
     assert exact.penalty.exact and exact.mpc.states is None
     assert exact.mpc.soft[0].rho == exact.penalty.advised > exact.penalty.rho_bar > 0
+
+
+def limited_output(D=None, terminal="invariant"):
+    """A double integrator whose speed is limited as an output, or with D another output is."""
+    system = jm.LinearSystem([[1.0, 1.0], [0.0, 1.0]], [0.5, 1.0])
+    box, push = jm.Box([-2.0, -2.0], [2.0, 2.0]), jm.Box(-0.3, 0.3)
+    speed = jm.Outputs([0.0, 1.0], -0.2, 0.2, D)
+    return jm.design(
+        system, [1.0, 0.0], 1.0, 1, states=box, inputs=push, terminal=terminal, outputs=speed
+    ).mpc
+
+
+@pytest.mark.parametrize("terminal", ["invariant", "ellipsoid"])
+def test_terminal_sets_keep_outputs_within_their_limits(terminal):
+    """The farthest output of the terminal set, under its law, is at its limit, or within it."""
+    for D in (None, [[0.5]]):
+        mpc = limited_output(D, terminal)
+        K = np.asarray(jm.lqr(mpc.system, mpc.Q, mpc.R).K)
+        output = np.array([0.0, 1.0]) + (0.5 * K[0] if D else 0.0)
+        farthest = float(mpc.terminal_set.support(output[None])[0])
+        assert farthest <= 0.2 + 1e-12 and (farthest > 0.19 or terminal == "ellipsoid")
+
+
+def test_limits_of_outputs_of_the_state_are_limits_of_states():
+    """Sets, claims and theorems are those of the problem with the same rows among the states."""
+    mpc = limited_output()
+    rows = jm.Polytope([[1.0, 0], [-1, 0], [0, 1], [0, -1]], [2.0, 2.0, 0.2, 0.2])
+    stated = replace(mpc, states=rows, outputs=())
+    assert (
+        mpc.terminal_set
+        == jm.design(mpc.system, mpc.Q, mpc.R, 1, states=rows, inputs=mpc.inputs).mpc.terminal_set
+    )
+    of_both = [jm.feasible.any_policy_polytope(problem) for problem in (mpc, stated)]
+    assert of_both[0] == of_both[1] == jm.feasible_polytope(mpc)
+    report = jm.recursive_feasibility(mpc, search=False, seconds=30)
+    assert report.strong.holds and report.law.holds
+    assert str(theorems(mpc)) == str(theorems(stated))
+    assert theorems(mpc).recursive_feasibility
 
 
 def test_harden_undoes_soften():

@@ -29,8 +29,8 @@ SAMPLES = 100
 @dataclasses.dataclass(frozen=True)
 class LinearLoops:
     """Closed loops from `count` random states over `seconds`, in the system's unit of time, or of
-    SAMPLES samples where that is None: starts are uniform in the middle part `spread` of the state
-    limits. disturbance: None, or a kind of `simulate_problem`."""
+    SAMPLES samples where that is None: starts are uniform around the target, up to the fraction
+    `spread` of the way to the state limits. disturbance: None, or a kind of `simulate_problem`."""
 
     config: configs.Config
     count: int
@@ -52,8 +52,8 @@ class LinearLoops:
         if not np.isfinite([lower, upper]).all():
             cure = "Bound every state, so that starts can be drawn"
             fail("limits.x_min, x_max", f"{lower} to {upper}", cure)
-        share = np.random.default_rng(self.seed).uniform(-1, 1, (self.count, len(lower)))
-        return (lower + upper) / 2 + self.spread * share * (upper - lower) / 2
+        ends = self.config.around_target(self.spread)
+        return np.random.default_rng(self.seed).uniform(*ends, (self.count, len(lower)))
 
     def run(self, mpc: MPC, x0s: np.ndarray) -> tuple[Run, np.ndarray]:
         """Return the loops from x0s (count, n) and what is added to their states (count, steps,

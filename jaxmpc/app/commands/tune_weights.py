@@ -253,7 +253,7 @@ def problem_of_file(command: TuneWeights) -> WeightProblem:
     )
     x0s, without_plan = feasible_states(
         hard if rho is None else soften(hard, rho),
-        *initial_range(config.state_range(), command.lower, command.upper, spread),
+        *initial_range(config.around_target(spread), command.lower, command.upper),
         command.count,
         command.seed,
         limits,

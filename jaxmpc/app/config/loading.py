@@ -331,6 +331,7 @@ def check(config: Config, command: str = "sweep") -> None:
             fail(f"{where}.quadratic", "given without rho", "Soft rows have a weight rho")
         for key in ("lower", "upper", "D", "names", "units"):
             value = getattr(rows, key) or None
+            value = None if isinstance(value, float) else value
             _check_length(f"{where}.{key}", value, len(rows.C), "One for each row of C")
         for key, size in (("C", n), ("D", m)):
             value = getattr(rows, key)

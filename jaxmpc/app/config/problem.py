@@ -24,10 +24,10 @@ from pydantic.dataclasses import dataclass
 from jaxmpc.checks import MOST_COUNT, fail
 from jaxmpc.explicit.exact_penalties import exact_penalty
 from jaxmpc.grids import axis_indices, grid, grid_ends, mesh
-from jaxmpc.mpc.problem import MPC, Outputs, Soft, soften
+from jaxmpc.mpc.problem import MPC, Outputs, Soft, soften, within_outputs
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope
-from jaxmpc.sets.invariant import named_terminal_set
+from jaxmpc.sets.invariant import OF_A_LAW, named_terminal_set
 from jaxmpc.systems.riccati import LQR, lqr
 from jaxmpc.systems.system import LinearSystem, numbered
 
@@ -131,8 +131,8 @@ class OutputsSection:
     """Rows lower <= C x + D u <= upper of p outputs: hard, or with rho soft, at that L1 weight."""
 
     C: Matrix  # (p, n)
-    lower: Limits | None = None  # (p,), -inf where free
-    upper: Limits | None = None  # (p,), inf where free
+    lower: Limits | Limit | None = None  # (p,) or one for all, -inf where free
+    upper: Limits | Limit | None = None  # (p,) or one for all, inf where free
     D: Matrix | None = None  # (p, m), none means zero
     stages: tuple[Whole, ...] | None = None  # the k at which they hold, none means the usual ones
     names: tuple[str, ...] = ()
@@ -356,7 +356,7 @@ class Config:
         inputs = Box(np.asarray(limits.u_min), np.asarray(limits.u_max))
         Q, R = to_matrix(cost.Q), to_matrix(cost.R)
         name, regulator = self.mpc.terminal, None
-        if cost.P == "lqr" or name in ("invariant", "ellipsoid"):
+        if cost.P == "lqr" or name in OF_A_LAW:
             regulator = lqr(system, Q, R)
         terminal_cost: Any = Q if cost.P == "Q" else None
         if cost.P == "lqr":
@@ -368,7 +368,10 @@ class Config:
         if law is not None and against.get("gain") is not None:
             law = LQR(K=against["gain"], P=law.P)
         W, E = (against.get(key) for key in ("disturbance", "disturbance_matrix"))
-        terminal_set: Any = named_terminal_set(name, system, law, states, inputs, W, E)
+        rows = [_rows(each) for each in self.outputs]
+        outputs = tuple(each for each in rows if isinstance(each, Outputs))
+        kept = within_outputs(states, outputs, law.K) if law and name in OF_A_LAW else states
+        terminal_set: Any = named_terminal_set(name, system, law, kept, inputs, W, E)
         if self.mpc.H_f is not None:
             terminal_set = Polytope(np.asarray(self.mpc.H_f), np.asarray(self.mpc.h_f))
         if self.mpc.P_f is not None:
@@ -388,8 +391,8 @@ class Config:
             input_rate_limit=as_array(limits.input_rate_limit),
             input_rate_weight=as_array(cost.input_rate_weight),
             stage_weights=as_array(cost.stage_weights),
-            outputs=tuple(rows for rows in map(_rows, self.outputs) if isinstance(rows, Outputs)),
-            soft=tuple(rows for rows in map(_rows, self.outputs) if isinstance(rows, Soft)),
+            outputs=outputs,
+            soft=tuple(each for each in rows if isinstance(each, Soft)),
             **against,
         )
         mpc.validate()
@@ -483,6 +486,14 @@ class Config:
             corners = np.asarray(states.vertices())
             return corners.min(axis=0), corners.max(axis=0)
         return np.full(n, -np.inf), np.full(n, np.inf)
+
+    def around_target(self, fraction: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return the states this fraction of the way, at most, from where closed loops aim in the
+        end to the ends (n,), (n,) of `state_range`."""
+        lower, upper = self.state_range()
+        aim = self.references().get("reference")
+        target = np.clip(0.0 if aim is None else aim.reshape(-1, len(lower))[-1], lower, upper)
+        return target + fraction * (lower - target), target + fraction * (upper - target)
 
 
 ADAPTER = TypeAdapter(Config)

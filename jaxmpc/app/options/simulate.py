@@ -64,10 +64,11 @@ class SimulateOptions:
 
     With --config FILE of a linear problem, one with the section [system]
       Such as jaxmpc simulate --config problem.toml --disturbance worst
-      Closed loops of its plant and controller, from states in the middle part --spread of the
-      state limits, under disturbances of its section [disturbance]. It counts the starts that have
-      a plan, and of these loops those that kept all limits; neither is a proof. A robust problem
-      keeps them all where its terminal set is invariant: jaxmpc recursion says so.
+      Closed loops of its plant and controller, from states around the target, up to the fraction
+      --spread of the way to the state limits, under disturbances of its section [disturbance]. It
+      counts the starts that have a plan, and of these loops those that kept all limits; neither is
+      a proof. A robust problem keeps them all where its terminal set is invariant: jaxmpc recursion
+      says so.
       Files: summary.json, and runs.npz with states, inputs, status and disturbances.
 
     Files, all in the folder of --output

@@ -154,7 +154,7 @@ class TuneWeightsOptions:
     )
     """Upper ends. States from which no plan keeps the limits (by linear programs) are replaced."""
     spread: Annotated[float | None, option("FRACTION", "0.9; robots 0.5"), SPREAD] = None
-    """Initial states are uniform up to this fraction of the way to the limits."""
+    """Initial states are uniform up to this fraction of the way from the target to the limits."""
     horizon: Horizon = None
     terminal: Terminal = None
     margin: Annotated[
