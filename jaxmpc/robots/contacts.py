@@ -25,6 +25,7 @@ import copy
 import functools
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -64,7 +65,9 @@ class Feet:
 
     names, geoms (k,): the feet, numbers of their geoms. radius (k,). distance (k,): from the ground
     at home, below 0 inside it. frames (k, 3, 3): rows normal (towards the foot) and two tangents.
-    friction (k,): coefficients of the plan. rate (k,): 1/s, by which a foot comes to rest.
+    held (k, 3): whether there is a force along these; along the last tangent there is none where no
+    joint moves the foot, as of a robot in a plane. friction (k,): coefficients of the plan. rate
+    (k,): 1/s, by which a foot comes to rest.
     """
 
     names: tuple[str, ...]
@@ -73,6 +76,7 @@ class Feet:
     radius: np.ndarray
     distance: np.ndarray
     frames: np.ndarray
+    held: np.ndarray
     friction: np.ndarray
     rate: np.ndarray
 
@@ -122,6 +126,7 @@ class Feet:
             radius=model.geom_size[geoms, 0],
             distance=np.array(distances),
             frames=np.array(frames),
+            held=np.ones((len(feet), 3), bool),
             friction=np.array(coefficients),
             rate=np.array(rates),
         )
@@ -155,6 +160,31 @@ class Feet:
             rows.append(frame @ J)
         return np.concatenate(rows)
 
+    def in_planes(self, model: "mujoco.MjModel", q: np.ndarray) -> "Feet":
+        """Return the feet with their last tangent along what no joint moves them, not held there.
+        Raises ValueError where none moves one along its normal, or it moves on a line, at most."""
+        data, random = mujoco.MjData(model), np.random.default_rng(0)
+        somewhere = []
+        for _ in range(4):
+            data.qpos[:] = q
+            mujoco.mj_integratePos(model, data.qpos, random.normal(size=model.nv), 1.0)
+            mujoco.mj_forward(model, data)
+            somewhere.append(self.jacobian(model, data).reshape(len(self), 3, -1))
+        frames, held = self.frames.copy(), self.held.copy()
+        for i, rows in enumerate(np.concatenate(somewhere, axis=2)):
+            ways, sizes, _ = np.linalg.svd(rows)
+            across = frames[i].T @ ways[:, 2]
+            if sizes[2] >= _RANK * sizes[0]:
+                continue
+            normal = frames[i, 0]
+            if abs(normal @ across) > _RANK or sizes[1] < _RANK * sizes[0]:
+                along = (np.round(across, 3) + 0.0).tolist()
+                problem = f"no joint moves {self.names[i]} along {along}"
+                cure = "Give the robot a free base, or joints that move a foot in a plane at least"
+                fail("feet", f"{problem}, where contact would push it", cure)
+            frames[i], held[i, 2] = [normal, np.cross(across, normal), across], False
+        return replace(self, frames=frames, held=held)
+
     @property
     def cone_names(self) -> tuple[str, ...]:
         """Return the names of the faces of the friction cones, five a foot."""
@@ -172,9 +202,19 @@ class Feet:
 
     def edges(self) -> np.ndarray:
         """Return the edges R (3k, 4k) of the friction cones, λ = R r with r ≥ 0: (1, ±μ, 0) and
-        (1, 0, ±μ)."""
+        (1, 0, ±μ), without the last forces where they are not held."""
         edges = [[[1, 1, 1, 1], [mu, -mu, 0, 0], [0, 0, mu, -mu]] for mu in self.friction]
-        return block_diag(*edges)
+        return self.held.reshape(-1, 1) * block_diag(*edges)
+
+
+def touching_spheres(model: "mujoco.MjModel", q: np.ndarray) -> tuple[str, ...]:
+    """Return the names of the spheres that touch the ground at q (nq,): those that may be feet."""
+    spheres = model.geom_type == mujoco.mjtGeom.mjGEOM_SPHERE
+    moving = model.body_weldid[model.geom_bodyid] != 0
+    geoms = [i for i in np.flatnonzero(spheres & moving) if names(model, "geom")[i]]
+    found = zip(geoms, _ground_contacts(model, q, np.array(geoms, int)), strict=True)
+    near = lambda i, contact: contact and contact.dist <= _TOUCHING * model.geom_size[i, 0]
+    return tuple(names(model, "geom")[i] for i, (contact, _) in found if near(i, contact))
 
 
 def _foot(model: "mujoco.MjModel", name: str) -> int:
@@ -265,7 +305,7 @@ class StandingPhysics(Physics):
         zero, one = jnp.zeros((), q.dtype), jnp.ones((), q.dtype)
         speeds, drift = jax.jvp(velocities, (zero,), (one,))
         standing = numbers.get(STANDING, np.ones(len(self.feet)))
-        rows = jnp.repeat(jnp.asarray(standing, q.dtype), 3)
+        rows = jnp.repeat(jnp.asarray(standing, q.dtype), 3) * self.feet.held.ravel()
         J = rows[:, None] * self._feet_jacobian(numbers, q)
         by_forces = solve(M, J.T)
         rate = np.repeat(self.feet.rate, 3).astype(q.dtype)
@@ -325,20 +365,13 @@ def _standing_physics(
     """Return the model with feet that stand; the same one for the same robot, feet and friction, so
     that programs compiled for it are found again."""
     model = physics.model
-    found = Feet.touching(plant, np.array(home), feet, friction)
+    found = Feet.touching(plant, np.array(home), feet, friction).in_planes(model, np.array(home))
     data = mujoco.MjData(model)
     data.qpos[:] = home
     mujoco.mj_forward(model, data)
-    J = found.jacobian(model, data)
-    for name, frame, rows in zip(found.names, found.frames, np.split(J, len(found)), strict=True):
-        ways, sizes, _ = np.linalg.svd(rows)
-        if sizes[-1] < _RANK * sizes[0]:
-            along = np.round(frame.T @ ways[:, -1], 3) + 0.0
-            problem = f"no joint moves {name} along {along.tolist()}, where contact would push it"
-            cure = "Give the robot a free base, or legs that move a foot in all three directions"
-            fail("feet", problem, cure)
+    J = found.jacobian(model, data)[found.held.ravel()]
     sizes = np.linalg.svd(J, compute_uv=False)
-    if len(sizes) < 3 * len(found) or sizes[-1] < _RANK * sizes[0]:
+    if len(sizes) < len(J) or sizes[-1] < _RANK * sizes[0]:
         problem = f"{', '.join(found.names)} hold one another: contact forces are not unique"
         fail("feet", problem, "Name one sphere for each leg that moves by itself")
     return StandingPhysics(model, found)

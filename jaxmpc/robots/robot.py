@@ -25,7 +25,7 @@ from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.jax_transformations import own_modes, varying
 from jaxmpc.qp.linalg import matmul
 from jaxmpc.robots.configurations import difference, nearest_turns, quaternions, retract
-from jaxmpc.robots.contacts import standing_physics
+from jaxmpc.robots.contacts import standing_physics, touching_spheres
 from jaxmpc.robots.couplings import MET, Couplings
 from jaxmpc.robots.description import RobotDescription
 from jaxmpc.robots.equilibria import (
@@ -206,6 +206,8 @@ class Robot(RobotDescription):
         rests = [rest_at(self, self._coupled(argument, row, couplings)) for row in rows]
         cure = "Choose a configuration that the actuators hold, or search for one: "
         cure += "robot.equilibrium(near=q)"
+        if feet is None and (spheres := touching_spheres(self.mujoco, rows[0])):
+            cure = f"Let it stand on what touches the ground: robot.standing({spheres})"
         if feet is not None:
             cure = "Choose another configuration, or give more torque, or feet with more friction"
         for rest in rests:

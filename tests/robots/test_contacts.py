@@ -297,18 +297,87 @@ def test_feet_rest_on_the_ground_alone(quadruped, standing):
         jm.robot_mpc(quadruped.standing(FEET), horizon=3, target=turned)
 
 
-def test_feet_that_nothing_moves_sideways_are_named():
-    """Of a robot in a plane, where a force across it would be any."""
-    free = '<freejoint name="base"/>'
-    plane = """<joint name="x" type="slide" axis="1 0 0"/>
-    <joint name="z" type="slide" axis="0 0 1"/><joint name="turn" axis="0 1 0"/>"""
+def in_plane(joints, direction):
+    """The file of the hopper whose trunk moves by these joints, its leg about this direction."""
     height = 0.6 * np.cos(BEND) + 0.0299
     text = HOPPER.format(height=height, shift=0, bend=BEND, back=-2 * BEND)
-    text = text.replace(free, plane).replace('<joint name="abduction" axis="1 0 0"/>', "")
+    text = text.replace('<freejoint name="base"/>', joints)
+    text = text.replace('<joint name="abduction" axis="1 0 0"/>', "")
     text = text.replace('<motor joint="abduction" ctrlrange="-30 30"/>', "")
-    text = re.sub('<key qpos="[^"]*"', f'<key qpos="0 0 0 {BEND} {-2 * BEND}"', text)
-    robot = jm.load_robot(mujoco.MjModel.from_xml_string(text))
-    with pytest.raises(ValueError, match=r"no joint moves foot along \[-?0.0, -?1.0, -?0.0\]"):
+    for joint in ("hip", "knee"):
+        text = text.replace(f'name="{joint}" axis="0 1 0"', f'name="{joint}" axis="{direction}"')
+    count = joints.count("<joint")
+    return re.sub('<key qpos="[^"]*"', f'<key qpos="{"0 " * count}{BEND} {-2 * BEND}"', text)
+
+
+PLANE = """<joint name="x" type="slide" axis="{0}"/><joint name="z" type="slide" axis="0 0 1"/>
+<joint name="turn" axis="{1}"/>"""
+
+
+@pytest.mark.parametrize("forward", [(1.0, 0.0), (0.6, 0.8)])
+def test_a_robot_in_a_plane_stands(forward):
+    """Its balance is that of three coordinates more, written down without the direction across."""
+    x, y = forward
+    text = in_plane(PLANE.format(f"{x} {y} 0", f"{-y} {x} 0"), f"{-y} {x} 0")
+    robot = jm.load_robot(mujoco.MjModel.from_xml_string(text)).standing(["foot"], friction=0.5)
+    feet, model = robot.predictor.feet, robot.predictor.model
+    np.testing.assert_allclose(np.abs(feet.frames[0] @ [-y, x, 0]), [0, 0, 1], atol=1e-12)
+    at, v, u = robot.home[: model.nq], np.array([0.1, 0.0, 0.2, 0.3, -0.4]), np.array([1.0, 6.0])
+    data, h = mujoco.MjData(model), model.opt.timestep
+
+    def jacobian(q):
+        data.qpos[:] = q
+        mujoco.mj_forward(model, data)
+        rows = np.zeros((3, model.nv))
+        point = data.geom("foot").xpos - [0, 0, 0.03]
+        mujoco.mj_jac(model, data, rows, None, point, model.geom("foot").bodyid[0])
+        return np.array([[0, 0, 1.0], [x, y, 0]]) @ rows
+
+    drift = (jacobian(at + 1e-5 * v) - jacobian(at - 1e-5 * v)) @ v / 2e-5
+    J = jacobian(at)
+    data.qvel[:], data.ctrl[:] = v, u
+    mujoco.mj_forward(model, data)
+    M = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, M)
+    M += h * np.diag(model.dof_damping)
+    force = data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator
+    K = np.block([[M, -J.T], [J, np.zeros((2, 2))]])
+    rate = 2 / (0.95 * 0.02)
+    found = np.linalg.solve(K, np.append(force, -drift - rate * (J @ v)))[model.nv :]
+    with jax.enable_x64(True):
+        forces = np.asarray(robot.predictor.contact_forces(np.append(at, v), u))
+    tangent = float(feet.frames[0, 1] @ [x, y, 0])
+    np.testing.assert_allclose(forces, [found[0], tangent * found[1], 0], atol=1e-6)
+
+
+def test_what_falls_without_feet_names_them(quadruped):
+    """The quadruped in a plane, of which nobody said that it stands."""
+    text = QUADRUPED.read_text()
+    joints = PLANE.format("1 0 0", "0 1 0")
+    assert "<freejoint" in text
+    text = re.sub(r"<freejoint[^>]*>", joints, text)
+    text = re.sub(r"<key [^>]*>", "", text)
+    home = np.append([0.0, 0.0, 0.0], quadruped.home[7:19])
+    spec = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(spec)
+    data.qpos[:] = home
+    mujoco.mj_forward(spec, data)
+    home[1] = -min(data.geom(foot).xpos[2] - spec.geom(foot).size[0] for foot in FEET)
+    with pytest.raises(ValueError, match=r"robot.standing\(\('FL', 'FR', 'RL', 'RR'\)\)"):
+        jm.load_robot(spec, home=home).equilibrium()
+
+
+def test_feet_that_nothing_moves_off_the_ground_are_named():
+    """The hopper on a slide along x alone, with a stiff leg."""
+    text = in_plane('<joint name="x" type="slide" axis="1 0 0"/>', "0 1 0")
+    text = re.sub(r'<joint name="(hip|knee)"[^>]*>', "", text)
+    text = re.sub(r"(?s)<actuator>.*</keyframe>", "", text)
+    text = text.replace("</worldbody>", '</worldbody><actuator><motor joint="x"/></actuator>')
+    height = f"{0.6 * np.cos(BEND) + 0.0299}"
+    assert height in text
+    robot = jm.load_robot(mujoco.MjModel.from_xml_string(text.replace(height, "0.6299")))
+    cure = "joints that move a foot in a plane at least"
+    with pytest.raises(ValueError, match=rf"no joint moves foot along .*, where .*{cure}"):
         robot.standing(["foot"])
 
 
