@@ -252,7 +252,13 @@ def require_finite(argument: str, value: Any) -> None:
         fail(argument, "holds NaN or infinity", "Give finite numbers")
 
 
-def require_symmetric_psd(argument: str, value: Any, *, definite: bool = False) -> None:
+def require_symmetric_psd(
+    argument: str,
+    value: Any,
+    *,
+    definite: bool = False,
+    cure: str = "Put a positive weight on every direction",
+) -> None:
     """Raise unless a readable square `value` is symmetric and positive (semi)definite."""
     require_finite(argument, value)
     if not concrete(value):
@@ -269,7 +275,7 @@ def require_symmetric_psd(argument: str, value: Any, *, definite: bool = False) 
     least = np.linalg.eigvalsh(matrix / 2 + matrix.T / 2)[0]
     if definite and least <= 0:
         what = f"is not positive definite (least eigenvalue {least:.3g})"
-        fail(argument, what, "Put a positive weight on every direction")
+        fail(argument, what, cure)
     if least < -1e-7 * scale:
         what = f"is not positive semidefinite (least eigenvalue {least:.3g})"
         fail(argument, what, "A negative weight makes the problem non-convex: check signs")

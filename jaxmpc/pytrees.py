@@ -92,6 +92,7 @@ def _naming_arguments(make: Callable[..., None]) -> Callable[..., None]:
 # Names that the literature, other libraries and the files of `jaxmpc` give to arguments.
 ELSEWHERE = {
     **{word: "terminal_cost" for word in ("P", "Qf", "QN", "terminal_weight")},
+    **{"A": "H", "b": "h"},  # of a polytope
     **{word: "horizon" for word in ("N", "T", "steps")},
     **{word: "states" for word in ("x_min", "x_max", "X", "state_limits")},
     **{word: "inputs" for word in ("u_min", "u_max", "U", "input_limits")},

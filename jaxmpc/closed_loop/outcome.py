@@ -250,7 +250,7 @@ def _plan_rows(s: dict[str, Any]) -> list[tuple[str, str]]:
 
 def _time_rows(s: dict[str, Any]) -> list[tuple[str, str]]:
     rows = [
-        ("settling", _middle(s["settling"], "never", f" {s['time_unit']}")),
+        ("settling", _middle(s["settling"], "never settle", f" {s['time_unit']}")),
         ("cost", _middle(s["cost"], "not finite", "")),
     ]
     this = s.get("this_run")

@@ -428,7 +428,10 @@ class MPC:
                 continue
             if not isinstance(value, kinds):
                 wanted = " or ".join(kind.__name__ for kind in kinds)
-                fail(name, f"is a {type(value).__name__}", f"Give a {wanted}, or None")
+                cure = f"Give a {wanted}, or None"
+                if isinstance(value, int):
+                    cure += "; numbers of steps are horizon= and control_horizon="
+                fail(name, f"is a {type(value).__name__}", cure)
             for where, part in _stage_by_stage(name, value, stages):
                 part.validate(where, size)
             if isinstance(value, Ellipsoid):

@@ -19,6 +19,10 @@ from jaxmpc.qp.linalg import arrays, floating_dtype, in_float64, matmul, solve, 
 from jaxmpc.systems.system import LinearSystem
 from jaxmpc.systems.units import natural_units
 
+NO_LQR = (
+    'Put a positive weight on every direction, or take another terminal cost (P = "Q" in files)'
+)
+
 # Modes closer than this to unreachable (least singular value, relative) count as such.
 UNREACHED = 1e-10
 # Doublings at most: 2^40 steps of a loop with spectral radius 1 - 1e-10 leave 1e-48.
@@ -80,12 +84,12 @@ def lqr(system: LinearSystem, Q: Reals, R: Reals) -> LQR:
     require_shape("R", R, (m, m), "Give one weight matrix for the inputs")
     if not concrete(system.A, system.B, Q, R):
         require_symmetric_psd("Q", Q)
-        require_symmetric_psd("R", R, definite=True)
+        require_symmetric_psd("R", R, definite=True, cure=NO_LQR)
         return _traced(system.A, system.B, Q, R)
     A, B = host_array("A", system.A), host_array("B", system.B)
     q, r = host_array("Q", Q), host_array("R", R)
     require_symmetric_psd("Q", q)
-    require_symmetric_psd("R", r, definite=True)
+    require_symmetric_psd("R", r, definite=True, cure=NO_LQR)
     units, moved = natural_units(A, B, q, r), _rank_tests(*natural_units(A, B).system(A, B))
     A, B = units.system(A, B)
     q, r = units.weights(q / 2 + q.T / 2, r / 2 + r.T / 2)

@@ -31,6 +31,9 @@ from jaxmpc.checks import (
 from jaxmpc.pytrees import prepared_pytree, static
 from jaxmpc.qp.linalg import matmul
 
+# What to do with the C and D of other toolboxes.
+NO_OUTPUTS = "Outputs are no part of a system: see jm.Outputs"
+
 _TEXTS = ("state_names", "input_names", "state_units", "input_units")
 _DELAY = (
     "Put the previous input into the state: for a delay below dt, LinearSystem([[A, B − B0], "
@@ -160,8 +163,7 @@ class LinearSystem:
         require_shape("A", A, (n, n), "A must be square")
         require_shape("B", B, (n, m), "Give B as many rows as A")
         if self.c is not None:
-            outputs = "outputs are no part of a system: see jm.Outputs"
-            cure = f"Give one number a state, or None; {outputs}"
+            cure = f"Give one number a state, or None. {NO_OUTPUTS}"
             require_shape("c", self._at_one_step("c", 1, steps), (n,), cure)
 
     def _at_one_step(self, name: str, axes: int, steps: int | None) -> Any:
@@ -171,7 +173,8 @@ class LinearSystem:
         if steps is None or len(shape) != axes + 1:
             return value
         if shape[0] != steps:
-            fail(name, f"shape {shape}", f"A leading axis counts the {steps} steps of the horizon")
+            cure = f"A leading axis counts the {steps} steps of the horizon"
+            fail(name, f"shape {shape}", f"{cure}. {NO_OUTPUTS}" if name == "c" else cure)
         return value[0] if steps else value
 
     @classmethod

@@ -5,6 +5,8 @@ import inspect
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from jaxmpc.arrays import Reals
 from jaxmpc.checks import fail, nearest, require_kind
 from jaxmpc.explicit.exact_penalties import ExactPenalty, exact_penalty
@@ -31,6 +33,15 @@ class Design:
     mpc: MPC
     regulator: LQR
     penalty: ExactPenalty | None
+
+    def __repr__(self) -> str:
+        """Return what was designed, in some lines."""
+        mpc, last = self.mpc, self.mpc.terminal_set
+        ends = "no terminal set" if last is None else f"terminal set {last}"
+        lines = [f"Design(horizon {mpc.horizon}, n = {mpc.system.n}, m = {mpc.system.m}", ends]
+        lines.append(f"LQR K = {np.array2string(np.asarray(self.regulator.K), precision=6)}")
+        lines += [] if self.penalty is None else [f"exact penalty {self.penalty.advised:.6g}"]
+        return "\n  ".join(lines) + ")"
 
     def controller(self, solver: ADMM | None = None) -> Controller:
         """Return the `Controller` of the problem, factored once."""

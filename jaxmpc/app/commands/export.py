@@ -1,6 +1,7 @@
 """The command `jaxmpc export`."""
 
 import dataclasses
+import shlex
 import sys
 from pathlib import Path
 from typing import Any, Literal
@@ -62,6 +63,8 @@ class Export(ExportOptions):
         if self.iterations is not None:
             solver = dataclasses.replace(solver, iterations=self.iterations)
         tolerance = TOLERANCE[self.dtype] if self.tolerance is None else self.tolerance
+        if self.law != "jax":  # what is wrong with the files is said before the work
+            CFiles.open(self.output, self.name, self.dtype, tolerance, TOLERANCE, self.overwrite)
         if checked and config.solver is None:
             solver = self.chosen_steps(mpc, ends, tolerance, config.references())
         paths, rows, summary = self.written(config, mpc, solver, tolerance)
@@ -88,7 +91,7 @@ class Export(ExportOptions):
             print(f"\nNext, in Python: {read}.call")
         else:
             call = f"cc -std=c99 -O2 {self.name}.c {self.name}_example.c -lm -o example"
-            print(f"\nNext: cd {self.output} && {call}")
+            print(f"\nNext: cd {shlex.quote(str(self.output))} && {call}")
         return Outcome(summary=as_json(summary))
 
     @property
@@ -100,9 +103,8 @@ class Export(ExportOptions):
         self, mpc: MPC, ends: tuple[np.ndarray, np.ndarray], tolerance: float, references: Any
     ) -> ADMM:
         """Return the solver that `choose_steps` finds from states between these ends."""
-        # What is wrong with the files is said before the work.
-        CFiles.open(self.output, self.name, self.dtype, tolerance, TOLERANCE, self.overwrite)
-        print("choosing steps along closed loops; some 20 s", file=sys.stderr)
+        what = "penalties" if self.iterations else "steps and penalties"
+        print(f"choosing {what} along closed loops; compiling, some 20 s", file=sys.stderr)
         return choose_steps(
             mpc,
             *ends,

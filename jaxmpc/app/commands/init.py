@@ -1,5 +1,6 @@
 """The command `jaxmpc init`."""
 
+import shlex
 from pathlib import Path
 
 from jaxmpc.app.options.init import InitOptions
@@ -13,15 +14,16 @@ class Init(InitOptions):
 
     def run(self) -> None:
         """Write the file. Raises ValueError where it exists or cannot be written."""
+        path = shlex.quote(str(self.output))  # for commands to copy
         where, text = (
             f"--output {self.output}",
             (FULL if self.full else TEMPLATE).read_text("utf-8"),
         )
         try:
             with self.output.open("w" if self.overwrite else "x", encoding="utf-8") as file:
-                file.write(text.replace("FILE", str(self.output)))
+                file.write(text.replace("FILE", path))
         except FileExistsError:
             fail(where, "exists", "Add --overwrite to replace it, or give another name")
         except OSError as error:
             fail(where, f"{error.strerror}", "Give a file that you can write")
-        print(f"{self.output}: edit it, then jaxmpc sweep --config {self.output}")
+        print(f"{self.output}: edit it, then jaxmpc sweep --config {path}")

@@ -154,8 +154,7 @@ def conclude(found: StoredMap, config: configs.Config, output: Path, start: floa
                 figure = plot_body(found.bounds)
             else:
                 figure = plot_feasible_set(found.bounds, picture=found.picture()).figure
-            save(figure, output / "map.png", config.name)
-            files.append(str(output / "map.png"))
+            files += save(figure, output / "map.png", config.name)
         except ValueError as error:
             picture = f"none: {error}"
     low, high = found.bounds.volume_bounds()

@@ -199,6 +199,9 @@ def _error_message(error: ValidationError, whole: Any) -> str:
     key = ".".join(where)
     if first["type"] == unknown:
         return _unknown_key(where, whole)
+    if first["type"] == "missing" and len(where) == 1:
+        write = "jaxmpc init writes a file that has all of them"
+        return f"section {key} is missing. Add [{key}] with its keys ({write})"
     if first["type"] == "missing":
         none = ", inf where there is none" if where[0] == "limits" else ""
         return f"{key} is missing. Add it{none} (jaxmpc sweep --help lists all keys)"
@@ -213,6 +216,8 @@ def _error_message(error: ValidationError, whole: Any) -> str:
         meant = nearest(given, [f.strip('"') for f in forms]) if isinstance(given, str) else ""
         *others, last = forms
         needed = f"{', '.join(others)} or {last}" if others else last
+        if isinstance(given, str) and not meant and re.fullmatch(r"[-+]?[\d.]+(e[-+]?\d+)?", given):
+            meant = f"Write {given}, without quotes"
         return f"{key}: {shown(given)} where {needed} is needed. {meant}".rstrip()
     # A value of the right type is wrong for what it is, a list for its first wrong entry.
     same = [e for e in same if e["type"] not in (*_OF_TYPES, "too_short")] or same

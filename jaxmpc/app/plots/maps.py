@@ -68,6 +68,9 @@ def plot_feasible_set(
         ax.fill(*ring(fmap.inner).T, color=FEASIBLE, linewidth=0)
         _paint_beyond(ax, ring(fmap.outer))
     handles += draw_bounds(ax, fmap)
+    few = np.flatnonzero(label == 0)
+    if len(few) <= 0.02 * len(label):  # on the lines of the bounds, which would hide them
+        ax.plot(*points[few].T, "s", color=UNDECIDED, markersize=2, zorder=5)
     finish(ax, fmap.axis_names, _map_title(fmap), handles)
     return ax
 

@@ -34,9 +34,9 @@ def for_column() -> bool:
     return rcParams["figure.figsize"][0] <= COLUMN
 
 
-def save(figure: Any, path: Path | BinaryIO, name: str = "") -> None:
-    """Write a figure, cut to its content, at the width of a column just as wide. name: of the
-    system, put before the first title.
+def save(figure: Any, path: Path | BinaryIO, name: str = "") -> list[str]:
+    """Write a figure, cut to its content, at the width of a column just as wide, and return the
+    names of the files. name: of the system, put before the first title.
 
     Letters that the usual font lacks are drawn with fonts that are installed and have them. Where
     Matplotlib's savefig.format is "pdf" or "svg", the picture is written beside it in that format;
@@ -51,15 +51,18 @@ def save(figure: Any, path: Path | BinaryIO, name: str = "") -> None:
     box: Any = fit_in_column(figure) if figure.get_figwidth() <= COLUMN else "tight"
     figure.savefig(path, format="png", dpi=150, bbox_inches=box, pad_inches=0.15)
     if not isinstance(path, Path):
-        return
+        return []
+    files = [str(path)]
     for suffix in ("pdf", "svg"):
         beside = path.with_suffix(f".{suffix}")
         if rcParams["savefig.format"] == suffix:
             # Type 42: conferences refuse the Type 3 that is Matplotlib's default.
             with rc_context({"pdf.fonttype": 42}):
                 figure.savefig(beside, bbox_inches=box, pad_inches=0.05)
+            files.append(str(beside))
         else:
             beside.unlink(missing_ok=True)
+    return files
 
 
 def _put_before_title(figure: Any, name: str) -> None:
