@@ -48,6 +48,24 @@ def rich_problem():
     )  # fmt: skip
 
 
+@pytest.mark.parametrize(
+    "call",
+    [
+        jm.feasible_polytope,
+        lambda mpc: jm.feasible.boundary(mpc, 4).points,
+        lambda mpc: jm.map_feasible_set(mpc, XS).label,
+        lambda mpc: jm.solve_many(mpc, XS).inputs,
+        lambda mpc: len(jm.explicit.critical_regions(mpc)),
+        lambda mpc: jm.explicit.exact_penalty(mpc).rho_bar,
+    ],
+)
+def test_what_is_known_is_computed_inside_traces(call):
+    """Functions of known data give what they give outside of jit."""
+    mpc, found = problem(), []
+    jax.make_jaxpr(lambda v: (found.append(call(mpc)), v)[1])(0.0)
+    jax.tree.map(np.testing.assert_array_equal, found[0], call(mpc))
+
+
 @cache
 def controller():
     return jm.Controller(problem())

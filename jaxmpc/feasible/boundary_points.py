@@ -8,8 +8,10 @@ from jaxmpc.feasible.policy_hull import PolicyRays
 from jaxmpc.feasible.policy_problem import PolicyProblem, problem_of
 from jaxmpc.feasible.rays import Boundary, Rays, ray_directions
 from jaxmpc.mpc.problem import MPC
+from jaxmpc.qp.jax_transformations import on_host
 
 
+@on_host
 def boundary(
     mpc: MPC,
     directions: int | np.ndarray,

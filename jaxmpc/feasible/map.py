@@ -24,7 +24,7 @@ from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.rays import closed_bounds
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import record
-from jaxmpc.qp.jax_transformations import default_platform
+from jaxmpc.qp.jax_transformations import default_platform, on_host
 from jaxmpc.qp.status import Status
 from jaxmpc.sets.convex_sets import Ellipsoid, Polytope
 from jaxmpc.sets.geometry import hull_volume
@@ -229,6 +229,7 @@ class FeasibleSetMap:
         H, h = np.asarray(body.H, float), np.asarray(body.h, float)
         return Polytope(H[:, axes], h - H[:, others] @ rest)
 
+    @on_host
     def refine(
         self, gap: float = 1e-6, rounds: int = 30, *, deadline: float = np.inf
     ) -> "FeasibleSetMap":
@@ -348,6 +349,7 @@ def excluded(
     return labels.changed(left, -1, Status.PRIMAL_INFEASIBLE, found)
 
 
+@on_host
 def map_feasible_set(
     mpc: MPC | FeasibilityProblem,
     x0s: Reals,
@@ -417,6 +419,7 @@ def map_feasible_set(
     return result if gap is None else result.refine(gap)
 
 
+@on_host
 def map_points(
     problem: FeasibilityProblem,
     x0s: Reals,

@@ -44,6 +44,7 @@ from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import layout
 from jaxmpc.pytrees import record
 from jaxmpc.qp.admm import ADMM, DEFAULT
+from jaxmpc.qp.jax_transformations import on_host
 from jaxmpc.sets.convex_sets import Polytope
 
 # Chains side by side, and points of a trial that looks for facets.
@@ -148,6 +149,7 @@ class FeasibleSamples:
         return xr.Dataset(data, coords={"state": list(self.mpc.labels)[: self.states.shape[1]]})
 
 
+@on_host
 def sample_feasible_set(
     mpc: MPC,
     count: int,

@@ -54,7 +54,7 @@ from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.admm import ADMM, DEFAULT, scaled_multipliers
 from jaxmpc.qp.dual import RIDGE, has_dual_steps, most_rows
-from jaxmpc.qp.jax_transformations import default_platform, map_blocks, true_places
+from jaxmpc.qp.jax_transformations import default_platform, map_blocks, on_host, true_places
 from jaxmpc.qp.linalg import matmul, solve
 from jaxmpc.qp.residuals import NEAR
 from jaxmpc.qp.solve import from_multipliers
@@ -75,6 +75,7 @@ CHOICE, QUANTILE_STATES = 4, 4096
 INACTIVE = 1e-9
 
 
+@on_host
 def solve_many(
     mpc: MPC | Controller,
     x0s: Reals,

@@ -102,6 +102,20 @@ def own_modes(function: F) -> F:
     return run  # type: ignore[return-value]
 
 
+def on_host(function: F) -> F:
+    """Return a function of known data, which is not traced, such that it may be called while
+    another one is traced too, as by `jax.jit`, and computes its result then and there."""
+
+    @functools.wraps(function)
+    def run(*args: Any, **kwargs: Any) -> Any:
+        if not concrete((args, kwargs)):  # it says what it has to be told
+            return function(*args, **kwargs)
+        with jax.ensure_compile_time_eval():
+            return function(*args, **kwargs)
+
+    return run  # type: ignore[return-value]
+
+
 def _explicit_mesh(args: tuple) -> AbstractMesh | None:
     """Return the mesh with explicit axes, of the context or of an argument, None for none.
 

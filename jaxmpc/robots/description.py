@@ -177,11 +177,11 @@ class RobotDescription:
 
 def host_coordinates(plant: Any, states: Any) -> np.ndarray:
     """Return the coordinates (..., n) of states (..., nq + nv + na) of a Robot or LinearPlant, in
-    float64 NumPy arrays."""
+    float64 NumPy arrays, also inside jit, where these states are known."""
     states = np.asarray(states, float)
     if plant.n == plant.state_size:  # no orientation: the same numbers
         return states
-    with jax.enable_x64(True):
+    with jax.enable_x64(True), jax.ensure_compile_time_eval():
         flat = jax.vmap(plant.coordinates)(states.reshape(-1, states.shape[-1]))
     return np.asarray(flat).reshape(*states.shape[:-1], plant.n)
 

@@ -26,7 +26,7 @@ from jax import Array
 from jaxmpc.arrays import as_floats
 from jaxmpc.checks import concrete, fail, positive, require_finite, require_kind, require_shape
 from jaxmpc.pytrees import named_pytree, pytree, static
-from jaxmpc.qp.jax_transformations import compiled_lightly
+from jaxmpc.qp.jax_transformations import compiled_lightly, on_host
 from jaxmpc.qp.linalg import matmul
 from jaxmpc.robots.configurations import product
 from jaxmpc.robots.contacts import FACES, STANDING, linear_cones
@@ -136,6 +136,7 @@ class Gait:
         return path.state(x, self.robot.mujoco.nq, seconds)
 
 
+@on_host
 def gait(
     robot: Robot,
     feet: Sequence[str],

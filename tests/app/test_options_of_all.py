@@ -158,13 +158,14 @@ def test_other_formats_are_refused(words, capsys):
 def test_pictures_in_another_format(tmp_path, monkeypatch, capsys):
     """Beside PNG, which stays; with another format the one of before goes."""
     monkeypatch.setitem(matplotlib.rcParams, "savefig.format", "png")
-    monkeypatch.setattr(init.Init, "run", lambda self: save(figure, path))
-    figure, path = Figure(), tmp_path / "map.png"
+    figure, path, written = Figure(), tmp_path / "map.png", []
+    monkeypatch.setattr(init.Init, "run", lambda self: written.append(save(figure, path)))
     figure.add_subplot().plot([0, 1], [0, 1])
     figure.axes[0].set_title("Ж", loc="left")
     for name, others in (("pdf", {".pdf"}), ("svg", {".svg"}), ("png", set())):
         assert cli.main(["init", "--format", name]) == 0
         assert {found.suffix for found in tmp_path.iterdir()} == {".png"} | others
+        assert sorted(written[-1]) == sorted(map(str, tmp_path.iterdir()))
         if name == "pdf":
             data = path.with_suffix(".pdf").read_bytes()
             assert data.startswith(b"%PDF") and b"/Type3" not in data and b"CIDFontType2" in data

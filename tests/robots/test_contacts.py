@@ -187,6 +187,16 @@ def test_linear_model_against_the_c_engine(standing):
     np.testing.assert_allclose(slack, weight * np.array([0.5, 0.5, 0.5, 0.5, 1]), rtol=1e-9)
 
 
+def test_problems_of_robots_with_orientations_take_traced_weights(standing):
+    """As in a loss of the weights: the robot is known."""
+    wanted, weights = jm.robot_mpc(standing, horizon=3), []
+    jax.make_jaxpr(lambda R: (weights.append(jm.robot_mpc(standing, R=R, horizon=3)), R)[1])(
+        np.asarray(wanted.R, np.float32)
+    )
+    np.testing.assert_array_equal(weights[0].states.upper, wanted.states.upper)
+    np.testing.assert_array_equal(weights[0].outputs[0].C, wanted.outputs[0].C)
+
+
 def test_statics_of_four_feet(quadruped):
     """Torques of rest need what a linear program finds: normal forces alone, of the weight."""
     robot = quadruped.standing(FEET)
