@@ -382,7 +382,7 @@ _condense_in_jax = compiled_lightly(0)(own_modes(_condense))
 
 def condensed_in_float64(mpc: MPC) -> Condensed:
     """`condense(mpc)` of a known problem, also inside jit: every array a float64 array of NumPy."""
-    with jax.enable_x64(True), jax.ensure_compile_time_eval():
+    with jax.enable_x64(True), jax.core.eval_context():
         return jax.tree.map(np.asarray, condense(in_float64(mpc)))
 
 

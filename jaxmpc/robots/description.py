@@ -181,7 +181,7 @@ def host_coordinates(plant: Any, states: Any) -> np.ndarray:
     states = np.asarray(states, float)
     if plant.n == plant.state_size:  # no orientation: the same numbers
         return states
-    with jax.enable_x64(True), jax.ensure_compile_time_eval():
+    with jax.enable_x64(True), jax.core.eval_context():
         flat = jax.vmap(plant.coordinates)(states.reshape(-1, states.shape[-1]))
     return np.asarray(flat).reshape(*states.shape[:-1], plant.n)
 
