@@ -370,6 +370,21 @@ def test_a_kernel_of_batches_of_batches(texts):
         kernel.call(sines, jax.ShapeDtypeStruct((16,), jnp.float64))(a[0, 0])
 
 
+def test_kernels_are_traced_inside_functions_of_known_data():
+    """`on_host` leaves what they are made of to be traced, inside a trace and outside."""
+
+    def double(a, out):
+        at = kernel.indices(16)
+        kernel.store(out.at[at], 2 * kernel.load(a.at[at]) + a[0])
+
+    a = np.arange(1.0, 17.0, dtype=np.float32)
+    call = jax_transformations.on_host(kernel.call(double, jax.ShapeDtypeStruct((16,), a.dtype)))
+    found = [call(a)]
+    jax.make_jaxpr(lambda v: (found.append(call(a)), v)[1])(0.0)
+    for each in found:
+        np.testing.assert_array_equal(each, 2 * a + 1)
+
+
 def test_kernels_traced_by_several_threads_are_those_of_one():
     """Each keeps its own stores while it is traced."""
 
