@@ -49,8 +49,9 @@ def folder(path, name="a <b> & joint"):
 
 def test_page_holds_results_configuration_and_pictures(tmp_path, capsys):
     folder(tmp_path)
-    assert cli.main(["report", str(tmp_path)]) == 0
-    assert "report.html" in capsys.readouterr().out
+    assert cli.main(["report", "--json", str(tmp_path)]) == 0
+    files = json.loads(capsys.readouterr().out)["summary"]["files"]
+    assert files == [str(tmp_path / "report.html")]
     read = Reader((tmp_path / "report.html").read_text())
     words = " ".join(read.words)
     assert read.open == []

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from jaxmpc.app.commands.outcome import RECORDS
+from jaxmpc.app.commands.outcome import RECORDS, Outcome
 from jaxmpc.app.options.report import ReportOptions
 from jaxmpc.checks import fail
 from jaxmpc.files import text_within
@@ -24,7 +24,7 @@ STYLE = (
 class Report(ReportOptions):
     """The command: its options, and `run`."""
 
-    def run(self) -> None:
+    def run(self) -> Outcome:
         """Write the page. Raises ValueError for a folder without a readable summary."""
         path = self.folder / "report.html"
         try:
@@ -35,6 +35,7 @@ class Report(ReportOptions):
                 str(self.folder), f"no page of it: {what}", "Give the folder of a finished command"
             )
         print(f"{path}: {path.stat().st_size / 1024:.0f} KiB")
+        return Outcome(summary={"files": [str(path)]})
 
 
 def html_page(title: str, parts: Iterable[str]) -> str:

@@ -77,6 +77,7 @@ class SimulateOptions:
                      solved. Red: limits exceeded.
       robots.gif     Some of the robots, in real time, with their numbers in runs.zarr. Green and
                      see-through: the target. Red frame: beyond the limit that it names.
+                     By the camera "view" of the model, else by one that sees all that moves.
                      Needs OpenGL: without a display libegl1 libegl-mesa0 libgl1-mesa-dri libgl1
                      (Debian, Ubuntu); without it no video.
       summary.json   The table's numbers, target, worst violation of each coordinate, versions.
