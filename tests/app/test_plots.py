@@ -503,6 +503,15 @@ def test_a_plan_over_its_horizon():
     np.testing.assert_allclose(q.lines[1].get_xdata(), [0.2])
     np.testing.assert_allclose(torque.lines[1].get_xdata(), [0.2, 0.3])
     require_no_empty_panel(figure)
+    # Outputs of several have panels of their own, with the steps at which they hold.
+    sum_of_all = jm.Outputs([[1, 1], [1, 0]], -3, 2.2, D=[[1.0], [0.0]], names=("sum", "q"),
+                            units=("m", "m"), stages=(1, 2))  # fmt: skip
+    *_, ax = plot_plan(plan, dataclasses.replace(mpc, outputs=sum_of_all)).axes
+    assert ax.get_ylabel() == "sum [m]" and len(plot_plan(plan, mpc).axes) == 3
+    np.testing.assert_allclose(ax.lines[0].get_ydata(), [np.nan, 3.6, 4.41, np.nan])
+    np.testing.assert_allclose(ax.patches[2].get_data().values, [np.nan, 2.2, 2.2, np.nan])
+    red = [line for line in ax.lines if line.get_color() == BROKEN]
+    np.testing.assert_array_equal(red[0].get_xdata(), [0.1, 0.2])
     # Each row is one of its own: beside one of inputs, with rounding, and in any unit.
     for unit in (1.0, 1e-7):
         C, D = [[1, 5.6e-17], [0, 0]], [[0], [1]]

@@ -188,8 +188,8 @@ def panel_grid(
 ) -> tuple[Figure, list[tuple[Axes, int, int]]]:
     """Return a figure with a panel for each state and input over time, and its panels.
 
-    A panel is (axes, 0 for a state or 1 for an input, its index). width: of a column, in inches;
-    height: of a row, least of all rows, and of the rest.
+    A panel is (axes, 0 for a state, 1 for an input, 2 for an output, its index). width: of a
+    column, in inches; height: of a row, least of all rows, and of the rest.
     """
     columns = panel_columns(plant)
     rows, (each, least, rest) = max(len(panels) for _, panels in columns), height
@@ -215,14 +215,16 @@ def panel_grid(
 def panel_columns(plant: Any) -> list[tuple[str, list[tuple[int, int, str]]]]:
     """Return the titles of the columns, each with its panels.
 
-    A panel is (0 for a state, 1 for an input; its index; its label).
+    A panel is (0 for a state, 1 for an input, 2 for an output; its index; its label).
     """
     if not isinstance(plant, Robot):
         system = plant.system
-        states = [(0, i, label) for i, label in enumerate(system.state_labels)]
+        titles = "states", "inputs", "outputs"
+        labels = system.state_labels, system.input_labels, getattr(plant, "outputs", ())
         return [
-            ("states", states),
-            ("inputs", [(1, i, label) for i, label in enumerate(system.input_labels)]),
+            (title, [(kind, i, label) for i, label in enumerate(each)])
+            for kind, (title, each) in enumerate(zip(titles, labels, strict=True))
+            if each
         ]
     label = lambda name, unit: (
         f"{name}{' ' if len(name) < 8 else chr(10)}[{unit}]" if unit else name
