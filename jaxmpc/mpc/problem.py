@@ -801,34 +801,41 @@ def output_stages(mpc: MPC, rows: Outputs) -> tuple[int, ...]:
     return tuple(k for k in mpc.state_stages if k < mpc.horizon or rows.D is None)
 
 
-def within_outputs(
-    states: Box | Polytope | None, outputs: Outputs | Sequence[Outputs], K: Reals | None = None
-) -> Box | Polytope | None:
-    """Return the states within their limits whose outputs are within theirs, C x, and with K (m, n)
-    those under u = K x, C x + D u. Rows that are given for single stages, or that differ from
-    stage to stage, are left out. NumPy in float64; not traceable."""
-    for rows in as_tuple("outputs", outputs, Outputs):
-        if rows.stages is None and not differing(rows):
-            C = host_array("C", rows.C)
-            if rows.D is not None and K is not None:
-                C = C + host_array("D", rows.D) @ host_array("K", K)
-            lower, upper = rows.sides
-            allowed = output_limits(C, lower, upper, rows.names, rows.units)
-            both: Any = allowed if states is None else states.intersect(allowed)
-            states = both
-    return states
+def within_outputs(mpc: MPC, K: Reals) -> Box | Polytope | None:
+    """Return the states within their limits where u = K x keeps the limits of outputs at the end
+    of the horizon, of C x + D K x, as a plan that goes on by this law has to; None without limits.
+    Rows that differ from stage to stage are left out. NumPy in float64; not traceable."""
+    outputs = as_tuple("outputs", mpc.outputs, Outputs)
+    end = {mpc.horizon - 1, mpc.horizon}
+    last = [rows for rows in outputs if end & set(output_stages(mpc, rows))]
+    return _limits_within(mpc.states, [rows for rows in last if not differing(rows)], K)
 
 
 def folded(mpc: MPC) -> MPC:
     """Return the same problem, where limits of outputs that are functions of the state at the
     stages of its limits are among these."""
     outputs = as_tuple("outputs", mpc.outputs, Outputs)
-    state = lambda rows: rows.stages is None and rows.D is None and not differing(rows)
     if not concrete((mpc.states, outputs)) or differing(mpc.states):
         return mpc
-    of_states = [rows for rows in outputs if state(rows)]
-    rest = tuple(rows for rows in outputs if not state(rows))
-    return replace(mpc, states=within_outputs(mpc.states, of_states), outputs=rest)
+    at_its_stages = lambda rows: output_stages(mpc, rows) == mpc.state_stages
+    of_state = lambda rows: rows.D is None and at_its_stages(rows) and not differing(rows)
+    states = _limits_within(mpc.states, list(filter(of_state, outputs)), None)
+    return replace(mpc, states=states, outputs=tuple(r for r in outputs if not of_state(r)))
+
+
+def _limits_within(
+    states: Box | Polytope | None, outputs: Sequence[Outputs], K: Reals | None
+) -> Box | Polytope | None:
+    """Return the states within their limits and those of outputs under u = K x."""
+    for rows in outputs:
+        C = host_array("C", rows.C)
+        if rows.D is not None and K is not None:
+            C = C + host_array("D", rows.D) @ host_array("K", K)
+        lower, upper = rows.sides
+        allowed = output_limits(C, lower, upper, rows.names, rows.units)
+        both: Any = allowed if states is None else states.intersect(allowed)
+        states = both
+    return states
 
 
 def as_tuple(name: str, value: Any, kind: type) -> tuple:

@@ -19,7 +19,7 @@ from jaxmpc.closed_loop.simulation import simulate_many
 from jaxmpc.feasible.map import FeasibleSetMap
 from jaxmpc.feasible.pipeline import Labels, Scope, labelled_parts
 from jaxmpc.feasible.problem import FeasibilityProblem
-from jaxmpc.mpc.problem import MPC, Outputs, Soft, as_tuple
+from jaxmpc.mpc.problem import MPC, Outputs, Soft, as_tuple, within_outputs
 from jaxmpc.pytrees import record
 from jaxmpc.recursion.analysis import examine
 from jaxmpc.recursion.time_budget import Budget
@@ -256,7 +256,8 @@ def mpc_with_terminal(robot: Robot, horizon: int, terminal: str) -> MPC:
     # At the set-point c is rounding.
     system = replace(about.system, c=None)
     regulator = lqr(system, mpc.Q, mpc.R)
-    found = named_terminal_set(terminal, system, regulator, about.states, about.inputs)
+    kept = within_outputs(about, regulator.K)
+    found = named_terminal_set(terminal, system, regulator, kept, about.inputs)
     return replace(mpc, terminal_set=translated(found, x))
 
 

@@ -103,7 +103,7 @@ def design(
         against = (settings.get(name) for name in ("disturbance", "disturbance_matrix"))
         gain = settings.get("gain")
         law = regulator if gain is None else LQR(K=gain, P=regulator.P)
-        kept = within_outputs(states, mpc.outputs, law.K) if terminal in OF_A_LAW else states
+        kept = within_outputs(mpc, law.K) if terminal in OF_A_LAW else states
         last = named_terminal_set(terminal, system, law, kept, inputs, *against)
     mpc = replace(mpc, terminal_set=last)
     mpc.validate()

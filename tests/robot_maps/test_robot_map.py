@@ -19,6 +19,19 @@ from jaxmpc.robot_maps.mapping import RobotSetting, deviations, with_initial_lim
 from jaxmpc.robot_maps.robot_map import RobotLoops
 
 SECONDS = 0.8
+SERVO = """<mujoco><option timestep=".01" gravity="0 0 0"/><worldbody><body>
+<joint name="slide" type="slide" axis="1 0 0" range="-1 1" damping=".1"/><geom size=".1" mass="1"/>
+</body></worldbody><actuator><position joint="slide" kp="100" kv="10" ctrlrange="-1 1"
+forcerange="-5 5"/></actuator></mujoco>"""
+
+
+def test_terminal_sets_of_robots_keep_the_forces_of_servos():
+    """On the set the law asks for as much force as the servo has, and no more."""
+    robot = jm.load_robot(mujoco.MjModel.from_xml_string(SERVO))
+    mpc = mapping.mpc_with_terminal(robot, 4, "invariant")
+    K = np.asarray(jm.lqr(replace(mpc.system, c=None), mpc.Q, mpc.R).K)
+    force = np.array([[-100.0, -10.0]]) + 100 * K  # at rest in 0
+    np.testing.assert_allclose(mpc.terminal_set.support(force), 5.0, rtol=1e-6)
 
 
 @pytest.fixture(scope="module")

@@ -40,13 +40,13 @@ def test_design_builds_what_its_parts_say():
     assert exact.mpc.soft[0].rho == exact.penalty.advised > exact.penalty.rho_bar > 0
 
 
-def limited_output(D=None, terminal="invariant"):
+def limited_output(D=None, terminal="invariant", stages=None, horizon=1):
     """A double integrator whose speed is limited as an output, or with D another output is."""
     system = jm.LinearSystem([[1.0, 1.0], [0.0, 1.0]], [0.5, 1.0])
     box, push = jm.Box([-2.0, -2.0], [2.0, 2.0]), jm.Box(-0.3, 0.3)
-    speed = jm.Outputs([0.0, 1.0], -0.2, 0.2, D)
+    speed = jm.Outputs([0.0, 1.0], -0.2, 0.2, D, stages)
     return jm.design(
-        system, [1.0, 0.0], 1.0, 1, states=box, inputs=push, terminal=terminal, outputs=speed
+        system, [1.0, 0.0], 1.0, horizon, states=box, inputs=push, terminal=terminal, outputs=speed
     ).mpc
 
 
@@ -59,6 +59,17 @@ def test_terminal_sets_keep_outputs_within_their_limits(terminal):
         output = np.array([0.0, 1.0]) + (0.5 * K[0] if D else 0.0)
         farthest = float(mpc.terminal_set.support(output[None])[0])
         assert farthest <= 0.2 + 1e-12 and (farthest > 0.19 or terminal == "ellipsoid")
+
+
+@pytest.mark.parametrize(
+    ("stages", "kept"), [((0, 1, 2), True), ((2,), True), ((3,), True), ((0, 1), False)]
+)
+def test_terminal_sets_keep_outputs_of_the_end_of_the_horizon(stages, kept):
+    """What a plan of three steps that goes on by the law has to keep."""
+    mpc = limited_output(stages=stages, horizon=3)
+    farthest = float(mpc.terminal_set.support(np.array([[0.0, 1.0]]))[0])
+    assert farthest == pytest.approx(0.2 if kept else 0.26833, abs=1e-4) or not kept
+    assert (farthest <= 0.2 + 1e-12) == kept
 
 
 def test_limits_of_outputs_of_the_state_are_limits_of_states():

@@ -369,13 +369,6 @@ class Config:
             law = LQR(K=against["gain"], P=law.P)
         W, E = (against.get(key) for key in ("disturbance", "disturbance_matrix"))
         rows = [_rows(each) for each in self.outputs]
-        outputs = tuple(each for each in rows if isinstance(each, Outputs))
-        kept = within_outputs(states, outputs, law.K) if law and name in OF_A_LAW else states
-        terminal_set: Any = named_terminal_set(name, system, law, kept, inputs, W, E)
-        if self.mpc.H_f is not None:
-            terminal_set = Polytope(np.asarray(self.mpc.H_f), np.asarray(self.mpc.h_f))
-        if self.mpc.P_f is not None:
-            terminal_set = Ellipsoid(np.asarray(self.mpc.P_f), np.asarray(self.mpc.level_f))
         mpc = MPC(
             system=system,
             Q=Q,
@@ -384,17 +377,23 @@ class Config:
             states=states,
             inputs=inputs,
             terminal_cost=terminal_cost,
-            terminal_set=terminal_set,
             constrain_initial=self.mpc.constrain_initial,
             control_horizon=self.mpc.control_horizon,
             constrained_stages=self.mpc.constrained_stages,
             input_rate_limit=as_array(limits.input_rate_limit),
             input_rate_weight=as_array(cost.input_rate_weight),
             stage_weights=as_array(cost.stage_weights),
-            outputs=outputs,
+            outputs=tuple(each for each in rows if isinstance(each, Outputs)),
             soft=tuple(each for each in rows if isinstance(each, Soft)),
             **against,
         )
+        kept = within_outputs(mpc, law.K) if law and name in OF_A_LAW else states
+        terminal_set: Any = named_terminal_set(name, system, law, kept, inputs, W, E)
+        if self.mpc.H_f is not None:
+            terminal_set = Polytope(np.asarray(self.mpc.H_f), np.asarray(self.mpc.h_f))
+        if self.mpc.P_f is not None:
+            terminal_set = Ellipsoid(np.asarray(self.mpc.P_f), np.asarray(self.mpc.level_f))
+        mpc = dataclasses.replace(mpc, terminal_set=terminal_set)
         mpc.validate()
         return mpc
 
