@@ -69,7 +69,7 @@ assert fmap.counts()["undecided"] == 0, "Every state has a label."
 
 # %%
 low, high = fmap.volume_bounds()
-print(f"area between {low:.3f} and {high:.3f} rad·rad/s")
+print(f"area between {low:.3f} and {high:.3f}{mpc.volume_unit()}")
 assert low < 1489 / 125 < high, "The bounds enclose 1489/125."
 
 # %% [markdown]
@@ -79,7 +79,7 @@ assert low < 1489 / 125 < high, "The bounds enclose 1489/125."
 # %%
 fmap = fmap.refine()
 low, high = fmap.volume_bounds()
-print(f"area between {low:.9f} and {high:.9f} rad·rad/s")
+print(f"area between {low:.9f} and {high:.9f}{mpc.volume_unit()}")
 assert (high - low) / high < 1e-6, "The bounds meet."
 assert low <= 1489 / 125 <= high, "They meet at 1489/125."
 
@@ -99,7 +99,7 @@ def draw(label, title, outline=True):
         corners = fmap.outer().vertices()
         corners = np.vstack([corners, corners[:1]])
         axis.plot(*corners.T, color="#d55e00", lw=1.5, label="boundary", zorder=3)
-    axis.set(xlabel="q [rad]", ylabel="dq [rad/s]", title=title)
+    axis.set(xlabel=fmap.axis_names[0], ylabel=fmap.axis_names[1], title=title)
     figure.legend(loc="outside right upper", fontsize=9)
     return axis
 
@@ -110,7 +110,7 @@ plt.show()
 # %% [markdown]
 # Almost all of the box of limits is feasible, but for two slivers: fast towards the upper stop,
 # and fast towards the lower one. Notebook 00 explained them by the braking distance. With full
-# torque the velocity falls by 0.4 rad/s in each step, so $\dot q = v$ needs
+# torque the velocity falls by $T u_{\max} / J = 0.4$ rad/s in each step, so $\dot q = v$ needs
 #
 # $$q \le 1.5 - 0.01 \sum_{j \ge 0} \max(v - 0.4 j,\ 0).$$
 #
