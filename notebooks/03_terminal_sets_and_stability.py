@@ -157,7 +157,7 @@ assert report.recursive_feasibility and report.stability, "Both theorems apply."
 
 # %%
 missing = jm.sets.verify_terminal(system, Q, R, np.zeros((2, 2)), None, limits, torque)
-print("\n".join(str(missing).splitlines()[:2]))
+print(repr(missing))
 assert not missing.recursive_feasibility and not missing.stability, "Neither applies."
 
 # %% [markdown]
