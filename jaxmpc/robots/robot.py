@@ -206,8 +206,9 @@ class Robot(RobotDescription):
         rests = [rest_at(self, self._coupled(argument, row, couplings)) for row in rows]
         cure = "Choose a configuration that the actuators hold, or search for one: "
         cure += "robot.equilibrium(near=q)"
-        if feet is None and (spheres := touching_spheres(self.mujoco, rows[0])):
-            cure = f"Let it stand on what touches the ground: robot.standing({spheres})"
+        if feet is None and not all(rest.held for rest in rests):
+            if spheres := touching_spheres(self.mujoco, rows[0]):
+                cure = f"Let it stand on what touches the ground: robot.standing({spheres})"
         if feet is not None:
             cure = "Choose another configuration, or give more torque, or feet with more friction"
         for rest in rests:

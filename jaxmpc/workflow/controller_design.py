@@ -79,7 +79,7 @@ def design(
 
     Raises ValueError for ill-posed data, as `lqr`, `maximal_invariant_set` and `MPC` do.
     """
-    known = [f.name for f in dataclasses.fields(MPC)]
+    known = [f.name for f in dataclasses.fields(MPC) if f.name != "terminal_set"]  # `terminal`
     for word in set(settings) - set(known):
         near = nearest(word, [*inspect.signature(design).parameters, *known])
         raise TypeError(
