@@ -249,6 +249,9 @@ def short_value(value: Any) -> str:
 
 
 def _is_here(array: Any) -> bool:
-    """Return whether an array can be read: not donated, and all of it of this process."""
-    on_host = not isinstance(array, jax.Array)
-    return on_host or (array.is_fully_addressable and not array.is_deleted())
+    """Return whether an array can be read: no random key, not donated, and all of it of this
+    process."""
+    if not isinstance(array, jax.Array):
+        return True
+    is_key = jax.dtypes.issubdtype(array.dtype, jax.dtypes.prng_key)
+    return not is_key and array.is_fully_addressable and not array.is_deleted()

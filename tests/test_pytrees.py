@@ -151,3 +151,5 @@ def test_objects_print_in_a_few_lines():
     donated = jnp.ones(2)
     donated.delete()
     assert repr(jm.ADMM(rho=donated)) == "ADMM(rho=float32 (2,))"
+    keyed = jm.closed_loop.Noise(process=[0.1, 0.1], seed=jax.random.key(0))
+    assert repr(keyed).startswith("Noise(process=[0.1, 0.1], seed=key<")
