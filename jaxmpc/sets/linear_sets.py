@@ -370,7 +370,10 @@ class Polytope(LinearSet):
             return self.preimage(inverse, -inverse @ t)
         corners = _vertices_of(self) if n <= polyhedra.TRIANGULATED else None
         if corners is not None and len(corners):
-            return Polytope.from_points(corners @ M.T + t)
+            # Where M takes a direction to 0, rounding would be a width.
+            first, terms = corners[0], np.abs(corners) @ np.abs(M).T
+            moved = cleaned((corners - first) @ M.T, terms + terms[0])
+            return Polytope.from_points(moved + (M @ first + t))
         hull = self._hull()
         if hull is None:
             return Polytope.empty(k)
@@ -501,9 +504,12 @@ class Polytope(LinearSet):
             binding = geometry.binding_rows(H, h)
         except Empty:
             return Polytope.empty(self.dimension)
-        reach = np.zeros(len(h))
+        reach, axes = np.zeros(len(h)), np.eye(self.dimension)
         reach[binding] = support(H[binding])
-        return Polytope(H, cleaned(h - reach, np.abs(h) + np.abs(reach)))
+        # Of supports far smaller than their terms, rounding is that of the terms.
+        far = np.maximum(np.abs(support(axes)), np.abs(support(-axes)))
+        terms = np.abs(H) @ np.where(np.isfinite(far), far, 0.0)
+        return Polytope(H, cleaned(h - reach, np.abs(h) + np.abs(reach) + terms))
 
     def reduce(self) -> "Polytope":
         """Return the same set with the fewest rows, each of norm 1; of a flat set its equalities as

@@ -91,6 +91,7 @@ def hull(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     scaled = np.where(size > 0, (points - center) / scale, 0.0)
     _, widths, Vt = np.linalg.svd(np.linalg.qr(scaled, mode="r"))
     rank = int((widths > FLAT * max(widths.max(initial=0.0), 1e-300)).sum())
+    rank = min(rank, len(points) - 1)  # rounding of the center may make it more
     if rank == n:
         normals, offsets = _full_hull(scaled)
         return _unscaled(normals, offsets, scale, center)
@@ -174,7 +175,9 @@ def _full_hull(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     with explained("points"):
         facets = convex_hull(points)[0].equations
     facets = facets[distinct(facets, 1e-10)]
-    return facets[:, :-1], -facets[:, -1]
+    normals = facets[:, :-1]
+    # (Rounding in place of a zero would be a limit, of its own size, where there is none.)
+    return np.where(np.abs(normals) <= 1e-14, 0.0, normals), -facets[:, -1]
 
 
 def _unscaled(
