@@ -216,7 +216,9 @@ def _equilibrium(step: OneStep, X: Polytope) -> tuple[np.ndarray, float]:
     row, column = scaling(M, np.zeros(n))
     M, drift = row[:, None] * M * column, row * drift
     z0 = -np.linalg.lstsq(M, drift, rcond=None)[0]
-    if np.any(np.abs(M @ z0 + drift) > 1e-9 * (np.abs(drift) + np.abs(M) @ np.abs(z0))):
+    terms = np.abs(drift) + np.abs(M) @ np.abs(z0)
+    # (Where all terms of a row are 0 but for rounding, that is of the size of other rows.)
+    if np.any(np.abs(M @ z0 + drift) > 1e-9 * terms + 1e-14 * terms.max()):
         return column * z0, -np.inf
     z0, free = column * z0, column[:, None] * scipy.linalg.null_space(M)
     rows, limits, depths = [], [], []

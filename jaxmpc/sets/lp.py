@@ -497,12 +497,25 @@ def _rounding_entries(L: np.ndarray, distance: np.ndarray, reach: np.ndarray) ->
     They are 1e10 times smaller than the largest of their row where each x_j is in units of how far
     along it the nearest row lets a point go. Then either the entry or the distance of that row is
     rounding: that which is smaller beside the largest entry of its row. In many rows such entries
-    would pass for another unit of their column.
+    would pass for another unit of their column. So would one beside the largest of its row where a
+    row with offset 0 ties the two coordinates in a ratio 1e13 times larger (cos(π/2) = 6e-17 in a
+    rotation).
     """
     nearest, top = reach.min(axis=0, initial=np.inf), L.max(axis=1, initial=-np.inf)
     known = np.isfinite(nearest)
     if not known.any():
         return np.zeros(L.shape, bool)
+    largest, tied = L.argmax(axis=1), ~np.isfinite(distance)
+    tiny = np.isfinite(reach) & (L < top[:, None] - 27) & tied.any()
+    for j, k in {(j, largest[i]) for i, j in np.argwhere(tiny)}:
+        both = tied & np.isfinite(L[:, j]) & np.isfinite(L[:, k])
+        ties, beside = (L[both, j] - L[both, k])[:, None], (L[both, k] - top[both])[:, None]
+        of = np.flatnonzero(tiny[:, j] & (largest == k))
+        small = L[of, j] - top[of]
+        tiny[of, j] = np.any((ties > small + 43) & (beside > small), axis=0)
+    if tiny.any():
+        without = np.where(tiny, np.inf, reach)
+        return tiny | _rounding_entries(np.where(tiny, -np.inf, L), distance, without)
     scaled = np.where(known, L + nearest, -np.inf)
     small = scaled - scaled.max(axis=1, keepdims=True) < -33
     return known & small & (L - top[:, None] < (distance - top)[reach.argmin(axis=0)])

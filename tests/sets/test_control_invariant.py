@@ -208,3 +208,14 @@ def test_control_invariant_sets_pass_through_jax():
     again = jax.tree.unflatten(tree, leaves)
     assert isinstance(again, ControlInvariantSet) and again.exact and again.reason == found.reason
     assert bool(found.contains(np.zeros(2))) and not bool(found.contains(np.array([1.5, 2.0])))
+
+
+def test_an_equilibrium_with_coordinates_at_zero():
+    """x+ = (x_2 - 0.2, 0) rests at (-0.2, 0), which was said not to be there: its second equation
+    is 0 but for rounding. Two steps keep all that one keeps."""
+    plant = LinearSystem([[0.0, 1.0], [0.0, 0.0]], np.zeros((2, 1)), c=[-0.2, 0.0])
+    limits = Box([-1.0, -1.8], [1.3, 1.6])
+    found = maximal_control_invariant_set(plant, limits, Box([-1.0], [1.0]))
+    assert found.exact and not found.is_empty()
+    axes = np.vstack([np.eye(2), -np.eye(2)])
+    np.testing.assert_allclose(found.support(axes), [1.3, 1.5, 1.0, 0.8], atol=1e-9)

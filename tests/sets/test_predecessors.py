@@ -64,3 +64,20 @@ def test_predecessor_by_ridges_and_by_elimination(monkeypatch):
     for direction in rng.standard_normal((10, 4)):  # a sum of sets: their supports add up
         expected = target.support(direction) + float(inputs.support(-direction @ system.B))
         assert by_ridges.support(direction) == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    "units", [np.ones(3), np.array([0.1, 1e4, 100.0]), np.array([1e4, 1e-5, 1e3])]
+)
+def test_states_that_a_rotated_plant_takes_to_a_point(units):
+    """cos(π/2) is 6e-17, a coordinate's own unit where other rows have offset 0. A'A = I, so that
+    they are -A'B u: a segment, of which coordinates came as 0."""
+    turn = np.pi / 2
+    A, B = np.eye(3), np.array([[0.6], [-0.3], [0.8]])
+    A[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
+    system = LinearSystem(units[:, None] * A / units, units[:, None] * B)
+    point, inputs = Box(np.zeros(3), np.zeros(3)), Box([-0.7], [0.4])
+    ends = -np.array([[-0.7], [0.4]]) @ (A.T @ B).T
+    axes = np.vstack([np.eye(3), -np.eye(3)])
+    found = predecessor(system, point, None, inputs)
+    np.testing.assert_allclose(found.support(axes / units), (ends @ axes.T).max(axis=0), atol=1e-9)
