@@ -512,7 +512,7 @@ def _rounding_entries(L: np.ndarray, distance: np.ndarray, reach: np.ndarray) ->
         ties, beside = (L[both, j] - L[both, k])[:, None], (L[both, k] - top[both])[:, None]
         of = np.flatnonzero(tiny[:, j] & (largest == k))
         small = L[of, j] - top[of]
-        tiny[of, j] = np.any((ties > small + 43) & (beside > small), axis=0)
+        tiny[of, j] = np.any((ties > small + 43) & (beside > small + 14), axis=0)
     if tiny.any():
         without = np.where(tiny, np.inf, reach)
         return tiny | _rounding_entries(np.where(tiny, -np.inf, L), distance, without)
