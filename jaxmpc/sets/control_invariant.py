@@ -217,7 +217,7 @@ def _equilibrium(step: OneStep, X: Polytope) -> tuple[np.ndarray, float]:
     M, drift = row[:, None] * M * column, row * drift
     z0 = -np.linalg.lstsq(M, drift, rcond=None)[0]
     terms = np.abs(drift) + np.abs(M) @ np.abs(z0)
-    # (Where all terms of a row are 0 but for rounding, that is of the size of other rows.)
+    # (Sums of zeros are off by rounding of the largest numbers.)
     if np.any(np.abs(M @ z0 + drift) > 1e-9 * terms + 1e-14 * terms.max()):
         return column * z0, -np.inf
     z0, free = column * z0, column[:, None] * scipy.linalg.null_space(M)

@@ -497,28 +497,26 @@ def _rounding_entries(L: np.ndarray, distance: np.ndarray, reach: np.ndarray) ->
     They are 1e10 times smaller than the largest of their row where each x_j is in units of how far
     along it the nearest row lets a point go. Then either the entry or the distance of that row is
     rounding: that which is smaller beside the largest entry of its row. In many rows such entries
-    would pass for another unit of their column. So would one beside the largest of its row where a
-    row with offset 0 ties the two coordinates in a ratio 1e13 times larger (cos(π/2) = 6e-17 in a
-    rotation).
+    would pass for another unit of their column. So would one (cos(π/2) = 6e-17 in a rotation)
+    beside the largest of its row, where a row with offset 0 ties the two coordinates in a ratio
+    1e13 (2^43) times larger, and its own entry is 1e4 (2^14) times farther from being rounding.
     """
     nearest, top = reach.min(axis=0, initial=np.inf), L.max(axis=1, initial=-np.inf)
     known = np.isfinite(nearest)
     if not known.any():
         return np.zeros(L.shape, bool)
-    largest, tied = L.argmax(axis=1), ~np.isfinite(distance)
-    tiny = np.isfinite(reach) & (L < top[:, None] - 27) & tied.any()
-    for j, k in {(j, largest[i]) for i, j in np.argwhere(tiny)}:
-        both = tied & np.isfinite(L[:, j]) & np.isfinite(L[:, k])
-        ties, beside = (L[both, j] - L[both, k])[:, None], (L[both, k] - top[both])[:, None]
-        of = np.flatnonzero(tiny[:, j] & (largest == k))
-        small = L[of, j] - top[of]
-        tiny[of, j] = np.any((ties > small + 43) & (beside > small + 14), axis=0)
+    beside, largest, tied = L - top[:, None], L.argmax(axis=1), ~np.isfinite(distance)
+    tiny = np.isfinite(reach) & (beside < -27) & tied.any()
+    for k in np.unique(largest[tiny.any(axis=1)]):
+        ties, of = tied & np.isfinite(L[:, k]), largest == k
+        ratio, own = L[ties] - L[ties, k, None], beside[ties, k, None]
+        tiny[of] &= beside[of] < np.minimum(ratio - 43, own - 14).max(axis=0, initial=-np.inf)
     if tiny.any():
         without = np.where(tiny, np.inf, reach)
         return tiny | _rounding_entries(np.where(tiny, -np.inf, L), distance, without)
     scaled = np.where(known, L + nearest, -np.inf)
     small = scaled - scaled.max(axis=1, keepdims=True) < -33
-    return known & small & (L - top[:, None] < (distance - top)[reach.argmin(axis=0)])
+    return known & small & (beside < (distance - top)[reach.argmin(axis=0)])
 
 
 def maximise(d: np.ndarray, G: np.ndarray, g: np.ndarray) -> Optimum:

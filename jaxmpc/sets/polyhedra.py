@@ -175,9 +175,8 @@ def _full_hull(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     with explained("points"):
         facets = convex_hull(points)[0].equations
     facets = facets[distinct(facets, 1e-10)]
-    normals = facets[:, :-1]
-    # (Rounding in place of a zero would be a limit, of its own size, where there is none.)
-    return np.where(np.abs(normals) <= 1e-14, 0.0, normals), -facets[:, -1]
+    # (Rounding in place of a zero would be a limit where there is none.)
+    return cleaned(facets[:, :-1], 1.0), -facets[:, -1]
 
 
 def _unscaled(

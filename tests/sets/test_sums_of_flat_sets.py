@@ -15,9 +15,8 @@ def whole_points(rng, n, most):
     rank = int(rng.integers(n + 1))
     if rank == 0:
         return np.zeros((1, n))
-    return rng.integers(-4, 5, (int(rng.integers(1, most)), rank)) @ rng.integers(
-        -3, 4.0, (rank, n)
-    )
+    weights = rng.integers(-4, 5, (int(rng.integers(1, most)), rank))
+    return weights @ rng.integers(-3, 4, (rank, n))
 
 
 def require_support(found, points, units):
@@ -32,7 +31,7 @@ def require_support(found, points, units):
 def test_what_is_added_can_be_subtracted(seed):
     rng = np.random.default_rng(seed)
     n = int(rng.integers(2, 5))
-    units = 10.0 ** rng.integers(-6, 7, n) * (seed % 2) + (1 - seed % 2)
+    units = 10.0 ** rng.integers(-6, 7, n) if seed % 2 else np.ones(n)
     S, W = (whole_points(rng, n, most) * units for most in (8, 7))
     summand = Polytope.from_points(W)
     both = Polytope.from_points(S).minkowski_sum(summand)
