@@ -263,22 +263,40 @@ def require_symmetric_psd(
     require_finite(argument, value)
     if not concrete(value):
         return
-    matrix = np.asarray(value, dtype=np.float64)
-    scale = max(np.abs(matrix).max(initial=0.0), np.finfo(np.float64).tiny)
-    if np.abs(matrix - matrix.T).max(initial=0.0) > 1e-6 * scale:
+    matrix = np.asarray(value)
+    eps = np.finfo(np.result_type(matrix, np.float32)).eps
+    matrix = matrix.astype(np.float64)
+    # Compared in units of the coordinates in which the diagonal is 1, where what its type rounds
+    # off beside the largest entry is left out.
+    noise = max(10 * eps * np.abs(matrix).max(initial=0.0), np.finfo(np.float64).tiny)
+    raised = matrix + noise * np.eye(len(matrix))
+    unit = 1 / np.sqrt(np.maximum(np.abs(np.diag(raised)), noise))
+    raised = unit[:, None] * raised * unit
+    if np.abs(raised - raised.T).max(initial=0.0) > max(1e-6, 10 * eps):
         for half, rest, k in (("triu", np.tril(matrix, -1), 1), ("tril", np.triu(matrix, 1), -1)):
             if not rest.any():
                 whole = f"{argument} + np.{half}({argument}, {k}).T"
                 cure = f"For one half of a symmetric matrix use {whole}"
                 fail(argument, "is triangular, not symmetric", cure)
         fail(argument, "is not symmetric", f"Use ({argument} + {argument}.T) / 2")
-    least = np.linalg.eigvalsh(matrix / 2 + matrix.T / 2)[0]
-    if definite and least <= 0:
-        what = f"is not positive definite (least eigenvalue {least:.3g})"
+    least = lambda M: np.linalg.eigvalsh(M / 2 + M.T / 2)[0]
+    if definite and not is_definite(matrix):
+        what = f"is not positive definite (least eigenvalue {least(matrix):.3g})"
         fail(argument, what, cure)
-    if least < -1e-7 * scale:
-        what = f"is not positive semidefinite (least eigenvalue {least:.3g})"
+    if least(raised) < -max(1e-7, 10 * eps):
+        what = f"is not positive semidefinite (least eigenvalue {least(matrix):.3g})"
         fail(argument, what, "A negative weight makes the problem non-convex: check signs")
+
+
+def is_definite(matrix: np.ndarray) -> bool:
+    """Return whether the symmetric part of a matrix (n, n) is positive definite by more than
+    rounding: signs of its eigenvalues are those in units in which its diagonal is 1."""
+    diagonal = np.diag(matrix)
+    if not np.all(diagonal > 0):
+        return False
+    unit = 1 / np.sqrt(diagonal)
+    scaled = unit[:, None] * (matrix / 2 + matrix.T / 2) * unit
+    return bool(np.linalg.eigvalsh(scaled)[0] > 4 * len(scaled) * np.finfo(np.float64).eps)
 
 
 def require_step_type(dtype: Any) -> None:

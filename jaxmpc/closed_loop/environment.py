@@ -5,13 +5,14 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
-from jaxmpc.arrays import Reals, as_floats, as_weight
+from jaxmpc.arrays import Reals, as_floats
 from jaxmpc.checks import fail, number, require_kind, require_shape, require_symmetric_psd, whole
 from jaxmpc.closed_loop.feedback import Feedback, LinearFeedback, model_of
 from jaxmpc.closed_loop.orientations import error_of
-from jaxmpc.closed_loop.robot_controller import robot_mpc
+from jaxmpc.closed_loop.robot_controller import weights_of
 from jaxmpc.closed_loop.variations import free_motions, start_room
 from jaxmpc.mpc.plan import limited
 from jaxmpc.pytrees import pytree, static
@@ -91,17 +92,17 @@ class Environment:
     ) -> "Environment":
         """Return the environment of a robot and a target (nq,), None for its home.
 
-        Q, R: weights, matrices or diagonals; None for those of `robot_mpc`. spread: starts are
-        uniform up to this fraction of the way from home to each limit (of 1 where there is none).
-        Raises ValueError as `robot_mpc` and `Robot.equilibrium` do.
+        Q, R: weights, matrices or diagonals, semidefinite; None for those of `robot_mpc`. spread:
+        starts are uniform up to this fraction of the way from home to each limit; a coordinate
+        without a limit starts within ±spread, in its unit. Raises ValueError for weights that are
+        not semidefinite, and as `Robot.equilibrium` does.
         """
         require_kind("robot", robot, Robot, LinearPlant)
         whole("length", length, 1)
         number("spread", spread, 0.0, "Give a fraction of at least 0")
-        if Q is None or R is None:
-            usual = robot_mpc(robot, Q, R, 1, target=target, terminal_cost=None, exact=False)
-            Q, R = usual.Q, usual.R
-        Q, R = as_weight(Q, robot.n), as_weight(R, robot.m)
+        if not isinstance(stop_at_limits, bool | np.bool_):
+            fail("stop_at_limits", f"{stop_at_limits!r}", "Give True or False")
+        Q, R = weights_of(robot, Q, R)
         for name, weight, size in (("Q", Q, robot.n), ("R", R, robot.m)):
             require_shape(name, weight, (size, size), "Give a matrix, or its diagonal")
             require_symmetric_psd(name, weight)

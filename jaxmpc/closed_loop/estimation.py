@@ -16,6 +16,7 @@ from jaxmpc.arrays import as_floats, dimensions, module_of
 from jaxmpc.checks import (
     concrete,
     fail,
+    is_definite,
     nearest,
     require_finite,
     require_kind,
@@ -233,7 +234,7 @@ class KalmanFilter:
                 fail(f"observer.{name}", "is None", "Give standard deviations or a covariance")
             require_spread(f"observer.{name}", getattr(self, name), size)
         V = covariance(self.measurement, p)
-        if concrete(V) and np.linalg.eigvalsh(V)[0] <= 0:
+        if concrete(V) and not is_definite(np.asarray(V)):
             cure = "Give each output some noise, or leave it out"
             fail("observer.measurement", "has a combination of outputs without noise", cure)
         require_spread("observer.initial", self.initial, n)
@@ -279,7 +280,7 @@ class KalmanFilter:
             require_spread(f"{name}.process", one.process, k)
             require_spread(f"{name}.initial", one.initial, k)
             W = covariance(one.process, k)
-            if concrete(W) and np.linalg.eigvalsh(W)[0] <= 0:
+            if concrete(W) and not is_definite(np.asarray(W)):
                 what, cure = "leaves a disturbance without noise", "Give it some, or leave it out"
                 fail(f"{name}.process", what, cure)
             if self.initial is not None and one.initial is None:

@@ -10,7 +10,7 @@ import gymnasium
 import jax
 import numpy as np
 
-from jaxmpc.checks import fail
+from jaxmpc.checks import fail, require_finite, require_real
 from jaxmpc.closed_loop.environment import Environment, EnvironmentState
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.load import load_robot
@@ -26,8 +26,9 @@ class RobotEnv(gymnasium.Env):
     are the inputs within their limits, observations (n,) the coordinates ξ, both float32; rewards
     minus the stage cost. An episode is truncated after `length` steps, and ends before where a
     limit is exceeded if `stop_at_limits`. info: "violation", the most by which a state limit is
-    exceeded, and "state" (nq + nv,). For many robots at once use `Environment` under `jax.vmap`.
-    Raises ValueError as `Environment.of` does, or for inputs without limits.
+    exceeded, and "state" x (nq + nv,). `reset(options={"state": x})` starts at x. For many robots
+    at once use `Environment` under `jax.vmap`. Raises ValueError as `Environment.of` does, or for
+    inputs without limits.
     """
 
     metadata = {"render_modes": []}
@@ -48,16 +49,23 @@ class RobotEnv(gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Return the observation of a random start, and info."""
+        """Return the observation of a random start, or of options["state"], and info."""
         super().reset(seed=seed)
         key = jax.random.key(int(self.np_random.integers(2**31)))
-        self._state = _reset(self.environment, key)
+        if options and set(options) != {"state"}:
+            fail("options", f"has the names {', '.join(options)}", 'Give {"state": x}, or none')
+        if options:
+            require_finite('options["state"]', options["state"])
+            self._state = self.environment.at(np.asarray(options["state"]))
+        else:
+            self._state = _reset(self.environment, key)
         return self._seen()
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Return observation, reward, terminated, truncated and info after an action."""
         if self._state is None:
             fail("step", "before the first reset", "Call reset()")
+        require_real("action", action)
         self._state = state = _step(self.environment, self._state, np.asarray(action))
         observation, info = self._seen()
         ended = bool(state.terminated), bool(state.truncated)

@@ -92,8 +92,7 @@ def robot_mpc(
     number("margin", margin, 0.0, "Give a fraction in [0, 1)")
     if not margin < 1:
         fail("margin", f"{margin}", "Give a fraction in [0, 1)")
-    positions = robot.mujoco.nv if isinstance(robot, Robot) else robot.n - robot.n // 2
-    Q, R = bryson_weights(robot.state_limits, robot.input_limits, positions, Q, R)
+    Q, R = weights_of(robot, Q, R)
     rests = True
     if target is None and isinstance(robot, Robot):
         rest, texts = settled(robot)
@@ -159,6 +158,12 @@ def with_margin(robot: Robot | LinearPlant, mpc: MPC, x: np.ndarray, margin: Any
 
     outputs = tuple(map(within, as_tuple("outputs", mpc.outputs, Outputs)))
     return replace(mpc, states=states, outputs=outputs)
+
+
+def weights_of(robot: Robot | LinearPlant, Q: Reals | None, R: Reals | None) -> tuple[Reals, Reals]:
+    """Return the weights as matrices, for None those of Bryson's rule with the robot's limits."""
+    positions = robot.mujoco.nv if isinstance(robot, Robot) else robot.n - robot.n // 2
+    return bryson_weights(robot.state_limits, robot.input_limits, positions, Q, R)
 
 
 def bryson_weights(

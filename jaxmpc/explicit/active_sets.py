@@ -688,7 +688,7 @@ def interior(H: np.ndarray, h: np.ndarray, far: float = 2.0) -> tuple[np.ndarray
             with contextlib.suppress(np.linalg.LinAlgError):
                 points[i] = np.linalg.solve(H[meeting], h[meeting])
     points = points[np.all(np.isfinite(points), axis=1)]
-    return points[distinct(points, 1e-7 * radius)], radius
+    return points[distinct(points, 5e-8 * radius)], radius
 
 
 def capped_ball(H: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, float]:

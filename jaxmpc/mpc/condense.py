@@ -23,7 +23,7 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.arrays import host_array
-from jaxmpc.checks import concrete, require_memory, require_untraced
+from jaxmpc.checks import concrete, is_definite, require_memory, require_untraced
 from jaxmpc.mpc.problem import MPC, Switch, Weights, dynamics_of, weights_of
 from jaxmpc.mpc.rows import Layout, blocks, bounds_of, layout_of, split, stacked
 from jaxmpc.mpc.stagewise.recursion_kernels import riccati_recursion
@@ -201,7 +201,7 @@ def prestabilising_gain(mpc: MPC) -> Any:
         Q, R = host_array("Q", mpc.Q), host_array("R", mpc.R)
     units = natural_units(A, B, Q, R)
     Q = Q + 1e-3 * units.cost_matrix(np.eye(len(Q)))
-    if np.linalg.eigvalsh((R + R.T) / 2)[0] <= 0:
+    if not is_definite(R):
         R = R + 1e-3 * np.diag(np.diag(B.T @ Q @ B))
     try:
         return lqr(system, Q, R).K

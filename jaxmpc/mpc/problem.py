@@ -22,6 +22,7 @@ from jaxmpc.arrays import (
 from jaxmpc.checks import (
     concrete,
     fail,
+    is_definite,
     require_finite,
     require_kind,
     require_last,
@@ -645,8 +646,8 @@ class MPC:
             return
         n, m, N = self.system.n, self.system.m, self.horizon
         all_R, stage = host_array("R", self.R), self.stage_weights
-        lowest = np.linalg.eigvalsh(symmetric(all_R))[..., 0]
-        if np.all(lowest > 0) and (stage is None or np.all(np.asarray(stage) > 0)):
+        definite = all(is_definite(R) for R in all_R.reshape(-1, m, m))
+        if definite and (stage is None or np.all(np.asarray(stage) > 0)):
             return
         stage = np.ones(N) if stage is None else np.asarray(stage, float)
         zero = lambda size: np.zeros((size, size))

@@ -101,7 +101,7 @@ class Ellipsoid(BasicSet):
     def contains(self, x: Reals, tolerance: float = 0.0) -> AnyTruth:
         """Return whether (x - center)'P (x - center) <= level + tolerance, for a point x (n,) or
         for each of many (k, n)."""
-        self._require_fields("Ellipsoid")
+        self.validate("Ellipsoid")
         x, many = one_or_many("x", x, self.dimension)
         xp, (P, level, x, tolerance) = numbers(self.P, self.level, x, tolerance)
         x = x if self.center is None else x - xp.asarray(self.center)
@@ -112,7 +112,7 @@ class Ellipsoid(BasicSet):
     def support(self, d: Reals) -> AnyNumber:
         """Return max d'x over the ellipsoid = d'center + sqrt(level d'P^-1 d), for one direction d
         (n,) or for each of many (k, n)."""
-        self._require_fields("Ellipsoid")
+        self.validate("Ellipsoid")
         d, many = one_or_many("d", d, self.dimension)
         xp, (along, P, level) = numbers(d, self.P, self.level)
         columns = along.T if many else along

@@ -106,12 +106,14 @@ def points(argument: str, value: Reals, n: int) -> np.ndarray:
     return found
 
 
-def chosen_axes(axes: Any, n: int) -> list[int]:
-    """Return the coordinates of an argument `axes`, checked."""
+def chosen_axes(
+    axes: Any, n: int, argument: str = "axes", cure: str = "Name those to keep"
+) -> list[int]:
+    """Return the coordinates of an argument, checked."""
     axes = [axes] if isinstance(axes, int | np.integer) else axes
-    axes = [whole("axes", axis, 0) for axis in entries("axes", axes, "Name those to keep")]
+    axes = [whole(argument, axis, 0) for axis in entries(argument, axes, cure)]
     if not axes or len(set(axes)) < len(axes) or not set(axes) <= set(range(n)):
-        fail("axes", f"{axes} are not distinct numbers in 0..{n - 1}", "Name those to keep")
+        fail(argument, f"{axes} are not distinct numbers in 0..{n - 1}", cure)
     return axes
 
 
@@ -120,7 +122,7 @@ def section(values: Any, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     their values, and the coordinates that are left."""
     if not isinstance(values, dict) or not values:
         fail("values", f"{values!r} fixes no coordinate", "Write it as {2: 0.5}")
-    fixed = np.array(chosen_axes(list(values), n))
+    fixed = np.array(chosen_axes(list(values), n, "values", "Write it as {axis: value}"))
     rest = np.setdiff1d(np.arange(n), fixed)
     if not rest.size:
         fail("values", "fixes every coordinate", "Ask `contains` whether a point is in the set")

@@ -14,7 +14,7 @@ import numpy as np
 import scipy
 
 from jaxmpc.arrays import Reals, host_array
-from jaxmpc.checks import fail, require_finite
+from jaxmpc.checks import concrete, fail, require_finite
 from jaxmpc.sets.lp import (
     FLAT,
     ROUNDING,
@@ -34,6 +34,9 @@ _HULL_DIMENSIONS = 6  # above, hulls have too many facets and one LP a row is fa
 _MOST_ROWS = 100_000  # an elimination step with more candidate rows raises ValueError
 _DOUBTFUL = 1e-5  # a smaller margin is looked at again, in other units
 ROUNDED = 4 * np.finfo(float).eps  # slacks up to this, of the terms of their row, are rounding
+
+
+NONE = "Loosen its rows, or ask is_empty() first"  # what to do about a set without a point
 
 
 class Flat(ValueError):
@@ -69,11 +72,26 @@ class Frame(NamedTuple):
         if len(self.center) == 1:
             ends = self.scale / np.array([self.Z.min(), self.Z.max()])
             return self.center + ends[:, None]
-        V = dual_hull(self.Z).intersections
-        V = V[distinct(V / np.abs(V).max(axis=0), 1e-10)]
+        hull = dual_hull(self.Z)
+        V, size = hull.intersections, np.abs(hull.intersections).max(axis=0)
+        sure = self._rounding_of_vertices(hull.dual_facets) / size
+        V = V[distinct(V / size, np.maximum(5e-11, sure.max(axis=1)))]
         if len(self.center) == 2:
             V = V[np.argsort(np.arctan2(V[:, 1], V[:, 0]))]
         return self.center + V * self.scale
+
+    def _rounding_of_vertices(self, facets: list[list[int]]) -> np.ndarray:
+        """Return how far rounding moves the vertices (k, n), in which these rows meet: an offset
+        is 1 + Z (center / scale), and loses some eps of its terms where the set is far from 0."""
+        lost = ROUNDED * (np.abs(self.Z) @ np.abs(self.center / self.scale))
+        moved = np.zeros((len(facets), len(self.center)))
+        many = np.array([len(rows) for rows in facets])
+        for count in np.unique(many):
+            at = np.array([rows for rows in facets if len(rows) == count])
+            moved[many == count] = (np.abs(np.linalg.pinv(self.Z[at])) @ lost[at][..., None])[
+                ..., 0
+            ]
+        return np.minimum(moved, 1e-3)
 
     @property
     def bounded(self) -> bool:
@@ -101,7 +119,7 @@ def framed(argument: str, G: np.ndarray, g: np.ndarray) -> Frame:
     program = Program(G, g)
     center, margin, _ = program.margin()
     if margin <= ROUNDING and program.empty:
-        raise Empty(f"{argument}: is empty: no point satisfies all its rows. Loosen its rows")
+        raise Empty(f"{argument}: is empty: no point satisfies all its rows. {NONE}")
 
     def slack_at(x: np.ndarray) -> tuple[np.ndarray, float]:
         """Return the slacks (rows,), and the least of them relative to the terms of its row."""
@@ -253,7 +271,7 @@ def largest_ball(argument: str, G: np.ndarray, g: np.ndarray) -> tuple[np.ndarra
     """
     length = np.linalg.norm(G, axis=1)
     if Program(G, g).empty:
-        fail(argument, "is empty: no point satisfies all its rows", "Loosen its rows")
+        fail(argument, "is empty: no point satisfies all its rows", NONE)
     x, _ = largest_margin(G, g, length)
     if x is None:
         return Program(G, g).margin()[0], np.inf
@@ -270,14 +288,19 @@ def irredundant_rows(argument: str, G: np.ndarray, g: np.ndarray) -> tuple[np.nd
 def binding_rows(H: np.ndarray, h: np.ndarray, argument: str = "Polytope") -> np.ndarray:
     """Return the indices of the rows of H x <= h that can bind; ValueError for NaN and for empty
     rows."""
-    require_finite(f"{argument}.H", H)
-    if np.isnan(h).any():
-        fail(f"{argument}.h", "holds NaN", "Use inf for a row that does not bind")
+    require_rows(H, h, argument)
     zero = ~H.any(axis=1)
     if np.any((h == -np.inf) | (zero & (h < 0))):
         what = "is empty: a row reads 0'x <= h < 0 or has h = -inf"
-        raise Empty(f"{argument}: {what}. Loosen that row")
+        raise Empty(f"{argument}: {what}. Loosen that row, or ask is_empty() first")
     return np.flatnonzero(~zero & (h < np.inf))
+
+
+def require_rows(H: Any, h: Any, argument: str = "Polytope") -> None:
+    """Raise ValueError where rows H x <= h that can be read hold NaN, or H infinity."""
+    require_finite(f"{argument}.H", H)
+    if concrete(h) and np.isnan(h).any():
+        fail(f"{argument}.h", "holds NaN", "Use inf for a row that does not bind")
 
 
 def unit_rows(H: Any, h: Any, argument: str = "Polytope") -> tuple[np.ndarray, np.ndarray]:
@@ -318,7 +341,7 @@ def hull_volume(points: Reals, *, thin: bool = False) -> float:
         return 0.0
     scaled = (points - center) / scale
     # Clusters confuse qhull; one point of each spans a hull that is no larger.
-    scaled = scaled if thin else scaled[distinct(scaled, 1e-11)]
+    scaled = scaled if thin else scaled[distinct(scaled, 5e-12)]
     try:
         hull, _ = convex_hull(scaled)
     except scipy.spatial.QhullError:  # flat
@@ -373,10 +396,15 @@ def explained(argument: str) -> Iterator[None]:
         fail(argument, f"too ill-conditioned for qhull ({reason})", "Rescale the coordinates")
 
 
-def distinct(points: np.ndarray, tolerance: float) -> np.ndarray:
-    """Return the indices of the points, of each cluster closer than `tolerance` only one."""
-    close = scipy.spatial.KDTree(points).query_pairs(tolerance, output_type="ndarray")
-    return np.setdiff1d(np.arange(len(points)), close.max(axis=1, initial=-1))
+def distinct(points: np.ndarray, radius: float | np.ndarray) -> np.ndarray:
+    """Return the indices of the points (k, n), of those whose balls of this radius, or of these
+    (k,), meet only the one with the smallest."""
+    radius = np.broadcast_to(radius, len(points))
+    order = np.argsort(radius, kind="stable")
+    points, radius = points[order], radius[order]
+    i, j = scipy.spatial.KDTree(points).query_pairs(2 * radius[-1], output_type="ndarray").T
+    meet = np.linalg.norm(points[i] - points[j], axis=1) <= radius[i] + radius[j]
+    return np.sort(np.delete(order, np.maximum(i, j)[meet]))
 
 
 def factors(Y: np.ndarray) -> tuple[list[tuple[np.ndarray, np.ndarray]], np.ndarray]:

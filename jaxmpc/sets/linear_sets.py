@@ -240,7 +240,7 @@ class Polytope(LinearSet):
         """
         self._require_fields(argument, dimension)
         if concrete((self.H, self.h)) and Program(*self.unit_rows(argument)).empty:
-            fail(argument, "is empty: no point satisfies all its rows", "Loosen its rows")
+            fail(argument, "is empty: no point satisfies all its rows", geometry.NONE)
 
     def is_empty(self) -> bool:
         """Return whether no point satisfies all rows: whether an LP finds multipliers y >= 0 with
@@ -268,6 +268,7 @@ class Polytope(LinearSet):
         each of many (k, n)."""
         self._require_fields("Polytope")
         x, many = one_or_many("x", x, self.dimension)
+        geometry.require_rows(self.H, self.h)
         xp, (H, h, x, tolerance) = numbers(self.H, self.h, x, tolerance)
         value = product(xp, x, H.T) if many else product(xp, H, x)
         return xp.all(value <= h + tolerance, axis=-1)
@@ -282,7 +283,7 @@ class Polytope(LinearSet):
         program = Program(G, g)
         values = [program.maximise(row).value for row in np.atleast_2d(d)]
         if -np.inf in values:
-            fail("Polytope", "is empty: no point satisfies all its rows", "Loosen its rows")
+            fail("Polytope", "is empty: no point satisfies all its rows", geometry.NONE)
         return np.array(values) if many else values[0]
 
     def rows(self) -> tuple[AnyArray, AnyArray, AnyArray]:
@@ -677,6 +678,8 @@ class Box(LinearSet):
         self._require_fields("Box")
         x, _ = one_or_many("x", x, self.dimension)
         xp, (x, lower, upper, tolerance) = numbers(x, self.lower, self.upper, tolerance)
+        if xp is np:
+            self._ends()  # refuses NaN
         return xp.all((lower - tolerance <= x) & (x <= upper + tolerance), axis=-1)
 
     def support(self, d: Reals) -> AnyNumber:
@@ -686,7 +689,7 @@ class Box(LinearSet):
         self._require_fields("Box")
         d, many = one_or_many("d", d, self.dimension)
         xp, (along, lower, upper) = numbers(d, self.lower, self.upper)
-        if xp is np and _misses(lower, upper).any():
+        if xp is np and _misses(*self._ends()).any():
             self.validate("Box")
         # The maximiser, with 0 where d is 0: there 0 * inf would be NaN.
         best = xp.where(along > 0, upper, xp.where(along < 0, lower, 0))
@@ -957,6 +960,7 @@ class Zonotope(LinearSet):
         or for each of many (k, n)."""
         self._require_fields("Zonotope")
         d, _ = one_or_many("d", d, self.dimension)
+        self.validate("Zonotope")
         xp, (along, center, G) = numbers(d, self.center, self.generators)
         return product(xp, along, center) + xp.abs(product(xp, along, G)).sum(axis=-1)
 

@@ -181,6 +181,11 @@ class BasicSet(ConvexSet):
             return False
         return other._covers(self, max(tolerance, ROUNDING))
 
+    def reduce(self) -> Any:
+        """Return the set without the rows that never bind: itself, where it is not given by
+        rows."""
+        return self
+
     def translate(self, by: Reals) -> Any:
         """Return {x + by : x in the set}, by (n,)."""
         by = vector("by", by, self.dimension)

@@ -174,7 +174,7 @@ def _full_hull(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     # qhull's facets are simplices: a facet with more corners comes several times.
     with explained("points"):
         facets = convex_hull(points)[0].equations
-    facets = facets[distinct(facets, 1e-10)]
+    facets = facets[distinct(facets, 5e-11)]
     # (Rounding in place of a zero would be a limit where there is none.)
     return cleaned(facets[:, :-1], 1.0), -facets[:, -1]
 

@@ -51,9 +51,9 @@ class MPCLayer:
         learn: Names of fields of the problem: "Q", "R", "P" or "terminal_cost", "stage_weights", …,
             with a dot those of its parts, "inputs.upper", "soft.rho"; "A", "B", "c" of the system.
             They may differ from step to step. Or a mapping of such names to a `Parameter`, which
-            says the domain, the start and the entries that are trained. Without one Q, R and other
-            weights stay diagonal where they are, and positive definite; penalties stay positive;
-            all else is real.
+            says the domain, the start and the entries that are trained. Where only names are given
+            Q, R and other weights stay diagonal where they are, and positive definite; penalties
+            stay positive; all else is real, and infinite limits stay as they are.
         solver: Settings of the solver: `smoothing` for derivatives that see limits before they are
             reached, `eps`, and so on.
         terminal_weight: "given": P is that of the problem, unless it is learned; "lqr": at each θ
@@ -65,8 +65,8 @@ class MPCLayer:
 
     A layer is no pytree: in a module of Equinox mark it as static, in one of Flax it is already. It
     may be called in `jax.jit`, `jax.vmap`, `jax.grad`, `jax.lax.scan`. Raises ValueError for names
-    that the problem does not have, for values that are not there (None), not finite or outside
-    their domain.
+    that the problem does not have, for values that are not there (None), outside their domain or
+    that the problem does not allow.
     """
 
     def __init__(
@@ -89,16 +89,17 @@ class MPCLayer:
             if same := [other for other in names[:i] if _path(other) == _path(name)]:
                 fail("learn", f"names {name!r} as {same[0]!r} already", "Leave one of the two out")
         given = learn if isinstance(learn, Mapping) else {}
+        mpc.validate()
         parts = {name: _at(mpc, name) for name in names}
         found = {n: given[n] if given else _parameter(n, value) for n, value in parts.items()}
         if not found:
             fail("learn", "names nothing", 'Give names of what is learned, such as ("Q", "R")')
-        require_parameters(found)
+        require_parameters(found, "learn")
         for name, parameter in found.items():
             if np.shape(parameter.value) != np.shape(parts[name]):
                 shape = np.shape(parameter.value)
                 fail(f"learn[{name!r}]", f"shape {shape}", f"Needed: {np.shape(parts[name])}")
-        mpc.validate()
+        _replaced(mpc, {name: start.value for name, start in found.items()}).validate()
         solver.validate()
         if terminal_weight == "lqr":
             mpc.require_constant("the LQR is that of one problem", "A", "B", "Q", "R")
@@ -118,19 +119,13 @@ class MPCLayer:
 
     def values(self, theta: Mapping[str, Any]) -> dict[str, np.ndarray]:
         """Return what is learned at θ, as NumPy arrays."""
+        self._require_theta(theta)
         return exact_values(self.parameters, theta)
 
     def problem(self, theta: Mapping[str, Any]) -> MPC:
         """Return the problem at θ, for any function that takes one. Works inside jit and grad."""
-        require_kind("theta", theta, Mapping, cure="Give a dict of arrays, as from init()")
-        if set(theta) != set(self.parameters):
-            given, needed = ", ".join(theta), ", ".join(self.parameters)
-            fail("theta", f"has the names {given or 'none'}", f"Needed: {needed}, as from init()")
-        for name, parameter in self.parameters.items():
-            shape = parameter.raw().shape
-            require_shape(f"theta[{name!r}]", theta[name], shape, "Give θ as from init()")
-        found = values(self.parameters, theta)
-        mpc = reduce(lambda mpc, name: _with(mpc, _path(name), found[name]), found, self.mpc)
+        self._require_theta(theta)
+        mpc = _replaced(self.mpc, values(self.parameters, theta))
         if self.terminal_weight == "lqr":
             mpc = replace(mpc, terminal_cost=lqr(mpc.system, mpc.Q, mpc.R).P)
         return mpc
@@ -162,6 +157,15 @@ class MPCLayer:
         """
         return self.controller(theta)(x, before, reference, **aim)
 
+    def _require_theta(self, theta: Any) -> None:
+        require_kind("theta", theta, Mapping, cure="Give a dict of arrays, as from init()")
+        if set(theta) != set(self.parameters):
+            given, needed = ", ".join(theta), ", ".join(self.parameters)
+            fail("theta", f"has the names {given or 'none'}", f"Needed: {needed}, as from init()")
+        for name, parameter in self.parameters.items():
+            shape = parameter.raw().shape
+            require_shape(f"theta[{name!r}]", theta[name], shape, "Give θ as from init()")
+
 
 def _path(name: str) -> list[str]:
     return SHORT.get(name, name).split(".")
@@ -176,13 +180,9 @@ def _at(mpc: MPC, name: str) -> np.ndarray:
         part = reduce(_part, parts, mpc)
         value = _part(part, last)
     except (AttributeError, IndexError):
-        if part is None and hasattr(mpc, parts[0]):
-            whole = ".".join(parts)
-            fail(
-                "learn",
-                f"{whole!r} is None in the problem",
-                f"Give it, with {last!r} to start from",
-            )
+        if (part is None or (isinstance(part, tuple) and not part)) and hasattr(mpc, parts[0]):
+            problem = f"{'.'.join(parts)!r} is {part} in the problem"
+            fail("learn", problem, f"Give it, with {last!r} to start from")
         fail("learn", f"{name!r} is no field of the problem", f"Give names {known}")
     part = _alone(part)
     field = getattr(part, "__dataclass_fields__", {}).get(last)
@@ -215,7 +215,14 @@ def _parameter(name: str, value: np.ndarray) -> Parameter:
     field = _path(name)[-1]
     if field in MATRICES and value.ndim >= 2:
         return Parameter(value, "diagonal" if is_diagonal(value) else "definite")
-    return Parameter(value, "positive" if field in (*MATRICES, *POSITIVE) else "real")
+    if field in (*MATRICES, *POSITIVE):
+        return Parameter(value, "positive")
+    return Parameter(value, train=np.isfinite(value))
+
+
+def _replaced(mpc: MPC, values: Mapping[str, Any]) -> MPC:
+    """Return the problem with other values at these names."""
+    return reduce(lambda mpc, name: _with(mpc, _path(name), values[name]), values, mpc)
 
 
 def _with(part: Any, path: list[str], value: Array) -> Any:

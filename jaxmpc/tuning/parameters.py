@@ -40,8 +40,8 @@ class Parameter:
     of an "interval", numbers or arrays of the value's shape. train: True, False, or a mask of the
     shape of what is free: of value itself, of the diagonal (n,) for "diagonal", of L (n, n) for
     "definite" (its upper triangle does not count), with a leading axis N where the value has one.
-    Entries not trained keep their value, up to rounding. Raises ValueError for values outside the
-    domain.
+    Entries not trained keep their value, up to rounding; of a "real" value they may be infinite,
+    as limits are that are not there. Raises ValueError for values outside the domain.
     """
 
     value: Any
@@ -54,7 +54,8 @@ class Parameter:
         if self.domain not in DOMAINS:
             fail("domain", f"{self.domain!r}", f"Give one of {', '.join(DOMAINS)}")
         value = host_array("value", self.value)
-        require_finite("value", value)
+        if self.domain != "real" or np.isnan(value).any():
+            require_finite("value", value)
         if self.domain in ("diagonal", "definite"):
             if self.domain == "diagonal" and value.ndim == 1:
                 value = np.diag(value)
@@ -82,10 +83,13 @@ class Parameter:
         free = self._free(value)
         train = np.asarray(self.train)
         if train.dtype != bool or train.shape not in ((), free.shape):
-            fail("train", f"{self.train!r}", f"Give True, False or a mask of shape {free.shape}")
+            mask = f"a mask of True and False, shape {free.shape}"
+            fail("train", f"{self.train!r}", f"Give True, False or {mask}")
         train = np.broadcast_to(train, free.shape)
         if self.domain == "definite":
             train = np.tril(train)
+        if not np.all(np.isfinite(free[train])):
+            fail("value", "is infinite where it is trained", "Use train=np.isfinite(value)")
         object.__setattr__(self, "train", train)
 
     def _free(self, value: np.ndarray) -> np.ndarray:
@@ -160,16 +164,16 @@ def _diagonal(v: Any) -> Any:
     return v[..., None] * np.eye(v.shape[-1], dtype=v.dtype)
 
 
-def require_parameters(parameters: Parameters) -> None:
+def require_parameters(parameters: Parameters, argument: str = "parameters") -> None:
     """Raise ValueError unless this is a mapping of Parameters of which something is trained."""
     if not isinstance(parameters, Mapping) or not parameters:
-        fail("parameters", f"is a {type(parameters).__name__}", 'Give {"Q": jm.Parameter(...)}')
+        fail(argument, f"is a {type(parameters).__name__}", 'Give {"Q": jm.Parameter(...)}')
     for name, parameter in parameters.items():
         if not isinstance(parameter, Parameter):
             kind = type(parameter).__name__
-            fail(f"parameters[{name!r}]", f"is a {kind}", "Wrap it in a jm.Parameter")
+            fail(f"{argument}[{name!r}]", f"is a {kind}", "Wrap it in a jm.Parameter")
     if not any(parameter.train.any() for parameter in parameters.values()):
-        fail("parameters", "none is trained", "Set train=True for what is to move")
+        fail(argument, "none is trained", "Set train=True for what is to move")
 
 
 def moved(parameters: Parameters, to: Mapping[str, Any]) -> dict[str, Parameter]:

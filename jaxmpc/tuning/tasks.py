@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmpc.arrays import Reals, numpy_array
-from jaxmpc.checks import fail, generator, require_finite, require_memory
+from jaxmpc.checks import fail, generator, is_definite, require_finite, require_memory
 from jaxmpc.closed_loop.outcome import evaluate_runs
 from jaxmpc.closed_loop.robot_controller import (
     RobotController,
@@ -174,7 +174,7 @@ def weight_parameters(
         diagonal = is_diagonal(value)
         if weights == "diagonal" and not diagonal and name != "P":
             fail("weights", f"diagonal, and {name} of the problem is not", "Add --weights full")
-        if np.linalg.eigvalsh((value + value.T) / 2)[0] <= 0:
+        if not is_definite(value):
             cure = "Give each direction a small weight to start from"
             fail(f"tune {name}", f"{name} is not positive definite", cure)
         domain = "diagonal" if weights == "diagonal" and diagonal else "definite"

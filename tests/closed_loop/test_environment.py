@@ -220,6 +220,36 @@ def test_rates_count_from_the_action_before():
         policy(x)
 
 
+def test_inputs_may_cost_nothing(environment):
+    """Nothing plans by the weights of an environment; those that are given decide nothing else."""
+    usual = Environment.of(environment.robot)
+    one = Environment.of(environment.robot, R=[0.0])
+    np.testing.assert_array_equal(one.R, np.zeros((1, 1)))
+    np.testing.assert_array_equal(one.Q, usual.Q)
+    np.testing.assert_array_equal(Environment.of(environment.robot, Q=[1.0, 0.0]).R, usual.R)
+
+
+def test_gymnasium_starts_where_it_is_told_and_names_what_is_wrong(environment):
+    pytest.importorskip("gymnasium")
+    from jaxmpc.closed_loop.gymnasium_env import RobotEnv
+
+    env = RobotEnv(environment.robot)
+    observation, info = env.reset(options={"state": [0.1, -0.2]})
+    np.testing.assert_allclose(info["state"], [0.1, -0.2], rtol=1e-6)
+    np.testing.assert_allclose(observation, [0.1, -0.2], rtol=1e-6)
+    for call, message in (
+        (lambda: env.reset(options={"x": 1}), "options: has the names x. Give {.state.: x}"),
+        (lambda: env.reset(options={"state": [0.1]}), "x: shape .1,. where .2,. is needed"),
+        (lambda: env.reset(options={"state": [np.nan, 0.0]}), "holds NaN"),
+        (lambda: env.step("a"), "action: 'a' where real numbers"),
+        (lambda: env.step(None), "action: None where real numbers"),
+        (lambda: env.step(["a"]), "action: entries of type <U1 where"),
+        (lambda: env.step([0.0, 1.0]), "action: shape .2,. where .1,. is needed"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            call()
+
+
 def test_bad_environments_are_named(environment):
     robot = environment.robot
     state = environment.at(np.zeros(2))
@@ -236,6 +266,7 @@ def test_bad_environments_are_named(environment):
         (lambda: Environment.of(robot, [1.0], Q=[1.0, 1.0], R=[1.0]), "target: needs torque"),
         (lambda: Environment.of(robot, Q=[1.0, -5.0], R=[1.0]), "Q: .*not positive semidef"),
         (lambda: Environment.of(robot, Q=[1.0, 5.0], R=[np.nan]), "R: holds NaN"),
+        (lambda: Environment.of(robot, stop_at_limits="no"), "stop_at_limits: 'no'. Give True"),
         (lambda: environment.at(np.zeros(3)), r"x: shape \(3,\) where"),
         (lambda: environment.reset(0), "key: 0. Give a JAX key"),
         (

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import jaxmpc as jm
+from jaxmpc.checks import require_symmetric_psd
 from jaxmpc.mpc import NonlinearMPC, Task, solve_nonlinear, solve_stagewise
 
 n, m, N = 2, 2, 4
@@ -124,6 +125,35 @@ def test_concrete_weights_within_rounding_of_symmetry():
     assert np.abs(plans[0].inputs - plans[1].inputs).max() > 1e-9
     with pytest.raises(ValueError, match=r"Q: is not symmetric. Use \(Q \+ Q.T\) / 2"):
         jm.solve(replace(mpc, Q=mpc.Q + 1e3 * tilt), X0)
+
+
+@pytest.mark.parametrize("spread", [0, 10, 50])
+def test_units_of_coordinates_decide_nothing_about_definiteness(spread):
+    """D M D has the signs of M (Sylvester's law of inertia), and powers of two round nothing."""
+    rng = np.random.default_rng(0)
+    answers = set()
+    for _ in range(100):
+        n = int(rng.integers(1, 5))
+        root = rng.integers(-2, 3, (int(rng.integers(1, n + 3)), n))
+        M = (root.T @ root - int(rng.integers(0, 2)) * np.diag(rng.integers(0, 2, n))).astype(float)
+        tilt = np.zeros((n, n))
+        tilt[0, -1] = float(rng.integers(0, 2))
+        D = 2.0 ** rng.integers(-spread, spread + 1, n)
+        # Beside 2^100 a difference may be rounding of 0, and so may all that is not definite.
+        for matrix in (M, M + tilt)[: 1 if spread > 10 else 2]:
+            signs = np.sign(np.round(np.linalg.eigvalsh((matrix + matrix.T) / 2), 9))
+            symmetric = np.array_equal(matrix, matrix.T)
+            asked = [(True, np.all(signs > 0)), (False, np.all(signs >= 0))]
+            for definite, right in asked[: 1 if spread > 10 else 2]:
+                expected = bool(symmetric and right)
+                try:
+                    require_symmetric_psd("M", D[:, None] * matrix * D, definite=definite)
+                    found = True
+                except ValueError:
+                    found = False
+                assert found == expected, (definite, D[:, None] * matrix * D)
+                answers.add((definite, expected))
+    assert len(answers) == (2 if spread > 10 else 4)
 
 
 # --- R = 0 -----------------------------------------------------------------------------------

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy
 from polytopes import assert_same_points, cube, unimodular
 from scipy.optimize import linprog
 
@@ -599,6 +600,20 @@ def test_volume_of_a_box_that_begins_next_to_zero(least):
 
 
 @pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("far", [1e3, 1e6, 1e8])
+def test_a_set_far_from_the_origin_has_its_vertices_once(far):
+    """Offsets lose what rounding takes from the distance, so that the facets of a vertex part."""
+    rng = np.random.default_rng(0)
+    for n in (2, 3, 3, 4, 4):
+        points, units = rng.normal(size=(20, n)), 10.0 ** rng.uniform(-4, 4, n)
+        center = far * rng.normal(size=n)
+        expected = points[scipy.spatial.ConvexHull(points).vertices]
+        moved = Polytope.from_points(points * units).translate(center * units)
+        found = moved.vertices() / units - center
+        assert len(found) == len(expected)
+        assert np.all(scipy.spatial.distance.cdist(found, expected).min(axis=0) < 1e-11 * far)
+
+
 def test_a_set_of_a_size_whose_square_vanishes_is_flat():
     """What is left of a point after rounding: it was divided by lengths that are 0."""
     with pytest.raises(ValueError, match="is flat"):

@@ -373,7 +373,11 @@ def test_ellipsoids_by_closed_forms():
         (lambda E: E @ np.diag([1.0, 0.0]), "M: has a rank below 2, so the set is unbounded"),
         (lambda E: E.slice({0: 3.0}), "Ellipsoid: is empty there"),
         (lambda E: E.slice({0: 0.0, 1: 0.0}), "values: fixes every coordinate"),
-        (lambda E: E.slice({2: 0.0}), "axes: .* are not distinct numbers in 0..1"),
+        (
+            lambda E: E.slice({2: 0.0}),
+            r"values: \[2\] are not distinct numbers in 0..1. Write it as {axis: v",
+        ),
+        (lambda E: E.project([2]), "axes: .* are not distinct numbers in 0..1. Name"),
         (lambda E: Ellipsoid(np.diag([1.0, 0]), 1.0).volume(), "P: is not positive definite"),
         (lambda E: E * [1, 2], "factor: .* is not a number"),
         (lambda E: E + "x", "by: "),
@@ -385,6 +389,30 @@ def test_ellipsoids_by_closed_forms():
 def test_what_is_refused_says_why(call, message):
     with pytest.raises(ValueError, match=message):
         call(Ellipsoid(np.eye(2), 1.0))
+
+
+@pytest.mark.parametrize(
+    "broken",
+    [
+        Polytope([[1.0, 0.0]], [np.nan]),
+        Polytope([[np.inf, 0.0]], [1.0]),
+        Box([0.0, np.nan], [1.0, 1.0]),
+        Zonotope([np.nan, 0.0], np.eye(2)),
+        Ellipsoid([[1.0, 2.0], [2.0, 1.0]], 1.0),
+        Ellipsoid([[1.0, 0.5], [0.0, 1.0]], 1.0),
+        Ellipsoid(np.eye(2), -1.0),
+    ],
+)
+def test_what_is_no_set_answers_no_question(broken):
+    for question in (broken.contains, broken.support):
+        with pytest.raises(ValueError, match=r"\.(H|h|lower|center|P|level): "):
+            question([1.0, 0.0])
+
+
+def test_reduce_is_there_for_every_set():
+    box = Box([-1, -1], [1, 1])
+    for given in (box, box.to_zonotope(), Ellipsoid(np.eye(2), 1.0)):
+        assert given.reduce() is given
 
 
 def test_sets_compare_with_sets_only_and_have_no_hash():

@@ -218,6 +218,10 @@ def test_a_closed_loop_carries_its_plans(layer, lesson, start, x64):
         (("A", "system.A"), "names 'system.A' as 'A' already"),
         ("Q.T", "'Q.T' is no field"),
         ("system.n", "'system.n' is no field"),
+        ("outputs.upper", r"'outputs' is \(\) in the problem. Give it, with 'upper'"),
+        ({"Q": 1.0}, r"learn\['Q'\]: is a float. Wrap it"),
+        ({"R": jm.Parameter([[-1.0]])}, "R: is not positive semidefinite"),
+        ({"states.upper": jm.Parameter([-2.0, 1.0])}, "states: is empty"),
         (3, "learn: 3. Give names"),
         ((3,), r"learn: \(3,\). Give names"),
         ({"Q": jm.Parameter(np.eye(3), "definite")}, r"learn\['Q'\]: shape \(3, 3\)"),
@@ -230,6 +234,25 @@ def test_refuses(learn, words):
         jm.tuning.MPCLayer(MPC, learn)
 
 
+def test_limits_that_are_not_there_stay_away():
+    """Of limits given by name the finite ones are learned."""
+    mpc = replace(MPC, states=jm.Box([-1, -np.inf], [1, np.inf]))
+    by_name = jm.tuning.MPCLayer(mpc, ("states.upper",))
+    start = jm.Parameter([1, np.inf], train=[True, False])
+    for layer in (by_name, jm.tuning.MPCLayer(mpc, {"states.upper": start})):
+        assert layer.init()["states.upper"].shape == (1,)
+        np.testing.assert_array_equal(layer.values({"states.upper": [0.5]})["states.upper"],
+                                      [0.5, np.inf])  # fmt: skip
+        layer.problem({"states.upper": np.array([0.5])}).validate()
+    for wrong in ([1, np.inf], [np.nan, 1]):
+        with pytest.raises(ValueError, match="value: (is infinite where it is trained|holds NaN)"):
+            jm.Parameter(wrong)
+    with pytest.raises(ValueError, match="value: holds NaN or infinity"):
+        jm.Parameter([1, np.inf], "positive", train=[True, False])
+    with pytest.raises(ValueError, match=r"True, False or a mask of True and False, shape \(2,\)"):
+        jm.Parameter([1, np.inf], train=[1, 0])
+
+
 def test_refuses_other_parameters(layer):
     for wrong in (None, np.zeros(3), jnp.zeros(2)):
         with pytest.raises(
@@ -240,6 +263,10 @@ def test_refuses_other_parameters(layer):
         layer({"Q": jnp.zeros(3)}, np.zeros(2))
     theta = layer.init()
     name = next(iter(theta))
+    with pytest.raises(ValueError, match="theta: has the names Q"):
+        layer.values({"Q": jnp.zeros(3)})
+    with pytest.raises(ValueError, match=rf"theta\['{name}'\]: shape \(9,\)"):
+        layer.values({**theta, name: jnp.zeros(9)})
     with pytest.raises(ValueError, match=rf"theta\['{name}'\]: shape \(9,\)"):
         jax.jit(layer)({**theta, name: jnp.zeros(9)}, np.zeros(2))
     with pytest.raises(ValueError, match="holds traced arrays"):
