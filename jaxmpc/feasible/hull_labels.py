@@ -34,7 +34,7 @@ from jaxmpc.feasible import proofs
 from jaxmpc.feasible.condensed_rows import ConstraintRows
 from jaxmpc.feasible.hard_constraints import ExactData
 from jaxmpc.feasible.problem import FeasibilityProblem
-from jaxmpc.feasible.rays import closed_bounds, filled
+from jaxmpc.feasible.rays import closed_bounds, filled, processor
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.jax_transformations import default_platform, own_modes
 from jaxmpc.sets.geometry import convex_hull
@@ -94,9 +94,8 @@ class Hull:
         facets = facets[np.linalg.cond(edges_of(theta, facets) / unit[:, None]) < 1e8]
         M = np.linalg.inv(edges_of(theta, facets))
         free = len(problem.view.others) if problem.view.projects else 0
-        exact, _ = rays.data
-        value = vertex_values(exact, rows, theta, w, free)
-        least, most = label_limits(exact, theta, value, facets, M)
+        value = vertex_values(rays.exact, rows, theta, w, free)
+        least, most = label_limits(rays.exact, theta, value, facets, M)
         gauge, slope = M.sum(axis=1), edges_of(value, facets) @ M
         _, _, normals, offsets, cuts = proved
         return cls(center, M, gauge, least, most, value[-1], slope, normals, offsets, cuts, gap)
@@ -139,7 +138,7 @@ def label_limits(
     most = np.max(moved, where=usable, initial=0.0)
 
     some = filled(len(points))
-    with jax.enable_x64(True):
+    with jax.enable_x64(True), jax.default_device(processor()):
         found = np.asarray(_slack(p, points[some], values[some], most))
     unmoved, slack = found[:, : len(points)]
     at_center = slack[-1]

@@ -105,15 +105,13 @@ def ray_directions(count: int, d: int) -> np.ndarray:
 class Rays:
     """Rays from one centre of the feasible set, for any number of directions.
 
-    center (d,) with w: a feasible pair with a margin. exact: the data for proofs; data:
-    these and the rows, on `processor()`.
+    center (d,) with w: a feasible pair with a margin. exact: the data for proofs.
     """
 
     problem: FeasibilityProblem
     center: np.ndarray
     w: np.ndarray
     exact: ExactData
-    data: tuple[ExactData, ConstraintRows]
 
     @classmethod
     def of(cls, problem: FeasibilityProblem, center: np.ndarray | None = None) -> "Rays":
@@ -122,10 +120,7 @@ class Rays:
         Raises ValueError where the feasible set is empty or flat, or the centre not inside it.
         """
         center, w = problem.programs.center(center)
-        exact = problem.exact(np.abs(center))
-        with jax.enable_x64(True):
-            data = jax.device_put((exact, problem.rows), processor())
-        return cls(problem, center, w, exact, data)
+        return cls(problem, center, w, problem.exact(np.abs(center)))
 
     def box(self) -> ProvedBounds:
         """Return the half-spaces of the bounding box, those that exist."""
@@ -163,8 +158,10 @@ class Rays:
     def prove(self, theta: np.ndarray, w: np.ndarray, y: np.ndarray) -> "ProvedRays":
         """Return `prove_rays` of (K, backoffs, …) points and (K, R) multipliers."""
         count, fill = len(y), filled(len(y))
-        with jax.enable_x64(True):
-            found = prove_rays(*self.data, theta[fill], w[fill], y[fill])
+        points = theta[fill], w[fill], y[fill]
+        # Arrays of NumPy go along faster than many small ones are put on a device one by one.
+        with jax.enable_x64(True), jax.default_device(processor()):
+            found = prove_rays(self.exact, self.problem.rows, *points)
         return jax.tree.map(lambda v: np.asarray(v)[:count], found)
 
 

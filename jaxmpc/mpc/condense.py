@@ -243,6 +243,12 @@ def _regulator(Q: Array, R: Array, A: Array, B: Array) -> Array:
 def condense(mpc: MPC) -> Condensed:
     """Build the parametric QP. Differentiable in every array of `mpc`. Raises ValueError where it
     does not fit into memory."""
+    mpc = _ready(mpc)
+    return on_device(_on_host(mpc)) if concrete(mpc) else _condense_in_jax(arrays(mpc))
+
+
+def _ready(mpc: MPC) -> MPC:
+    """Return the problem with its gains, if it can be condensed."""
     a_step = sum(np.shape(s.rows()[1])[-1] for s in (mpc.states, mpc.inputs) if s is not None)
     sizes = mpc.horizon, mpc.system.n, mpc.system.m, mpc.control_horizon, a_step
     needed = condensed_bytes(*sizes) * jax.dtypes.canonicalize_dtype(float).itemsize / 8
@@ -251,10 +257,13 @@ def condense(mpc: MPC) -> Condensed:
     mpc = filled_in(mpc)
     if mpc.disturbance is not None and concrete(mpc):
         require_room(mpc, blocks(mpc, float))
-    if concrete(mpc):
-        with np.errstate(over="ignore", invalid="ignore"):  # the status tells
-            return on_device(_condense(host_arrays(mpc)))
-    return _condense_in_jax(arrays(mpc))
+    return mpc
+
+
+def _on_host(mpc: MPC) -> Condensed:
+    """Condense a known problem into arrays of NumPy, in the present precision."""
+    with np.errstate(over="ignore", invalid="ignore"):  # the status tells
+        return _condense(host_arrays(mpc))
 
 
 def filled_in(mpc: MPC) -> MPC:
@@ -383,7 +392,7 @@ _condense_in_jax = compiled_lightly(0)(own_modes(_condense))
 def condensed_in_float64(mpc: MPC) -> Condensed:
     """`condense(mpc)` of a known problem, also inside jit: every array a float64 array of NumPy."""
     with jax.enable_x64(True), jax.core.eval_context():
-        return jax.tree.map(np.asarray, condense(in_float64(mpc)))
+        return jax.tree.map(np.asarray, _on_host(_ready(in_float64(mpc))))
 
 
 class Inequalities(NamedTuple):

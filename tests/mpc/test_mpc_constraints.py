@@ -15,8 +15,6 @@ import scipy
 from jax import enable_x64
 
 import jaxmpc as jm
-from jaxmpc.feasible import proofs
-from jaxmpc.feasible.hard_constraints import exact_data, hard_blocks, make_view
 from jaxmpc.mpc.plan import active_constraints
 from jaxmpc.mpc.problem import Outputs, Soft, soften
 from jaxmpc.mpc.rows import row_table
@@ -900,24 +898,11 @@ def test_a_move_that_no_other_row_sees_leaves_the_set_its_inside():
     np.testing.assert_allclose(found.inner, found.outer, rtol=1e-8)
 
 
-def test_cut_of_an_asymmetric_ellipsoid():
-    """x'Px ≤ level is the ellipsoid of the symmetric part: the cut's offset may not fall below
-    its support √(level a'S⁻¹a)."""
+def test_an_ellipsoid_that_is_not_symmetric_in_its_own_units_is_refused():
+    """1e-6 beside 1 is no rounding where the coordinates' own entries are 1 and 1e-6."""
     P = np.array([[1.0, 4.9e-7], [-4.9e-7, 1e-6]])
-    mpc = jm.MPC(
-        system=jm.LinearSystem(EYE, np.zeros((2, 1))), Q=EYE, R=np.eye(1), horizon=1,
-        inputs=problems.symmetric(1.0), terminal_set=Ellipsoid(P, 1.0),
-    )  # fmt: skip
-    mpc.validate()
-    problem = exact_data(mpc, make_view(mpc), hard_blocks(mpc), np.array([10.0, 1e4]))
-    S, worst = (P + P.T) / 2, 0.0
-    cut = jax.jit(lambda y: proofs.cut(problem, np.zeros((1, 0)), np.zeros(0), y))
-    for angle in np.linspace(0, np.pi, 9):
-        y = np.array([np.cos(angle), np.sin(angle)])
-        a, b, _ = map(np.asarray, cut(y))
-        truth = np.sqrt(a @ np.linalg.solve(S, a))
-        worst = max(worst, (truth - b) / truth)
-    assert worst <= 1e-12
+    with pytest.raises(ValueError, match="X_f.P: is not symmetric"):
+        Ellipsoid(P, 1.0).validate("X_f")
 
 
 # --- soften, equilibrium, errors ----------------------------------------------------------------

@@ -17,6 +17,7 @@ from jaxmpc.app.options.verify import VerifyOptions
 from jaxmpc.checks import shown
 from jaxmpc.feasible.policy_problem import problem_of
 from jaxmpc.files import as_json
+from jaxmpc.mpc.problem import folded
 from jaxmpc.verify.stored_map import Verification, find_store, verify_map
 
 # Failures that are printed.
@@ -81,7 +82,9 @@ def contradictions(attributes: Mapping[str, Any], axes: Mapping[str, np.ndarray]
             region = configs.sweep_points(made) if axes else None
             lines = () if region is None else region.along
             view = (None, None) if region is None else (region.axes, region.fixed)
-            built = problem_of(made.build_mpc(), *view).plain()
+            mpc = made.build_mpc()
+            # A recursion report is of the problem whose outputs are rows of its states.
+            built = problem_of(mpc if axes else folded(mpc), *view).plain()
         elif "robot" not in config:
             text = (
                 "made by sweep_into: the problem is the stored one, no configuration makes it again"
@@ -110,10 +113,10 @@ def contradictions(attributes: Mapping[str, Any], axes: Mapping[str, np.ndarray]
             built = problem_again(config, np.array([lower, upper])).plain()
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         return [f"configuration: makes no problem ({error})"]
+    apart = (_apart(f"problem.{key}", problem.get(key), value) for key, value in built.items())
     found = [
-        f"problem.{key}: {shown(problem.get(key))}, the configuration says {shown(value)}"
-        for key, value in built.items()
-        if not alike(problem.get(key), value)
+        f"{name}: {shown(stored)}, the configuration says {shown(value)}"
+        for name, stored, value in filter(None, apart)
     ]
     for (name, line), stated in zip(axes.items(), lines, strict=bool(lines)):
         if not alike(line.tolist(), stated.tolist()):
@@ -126,6 +129,19 @@ def _is_here(robot: Any) -> bool:
     from jaxmpc.robots.load import MODELS
 
     return bool(find_spec("mujoco")) and (robot in MODELS or Path(robot).is_file())
+
+
+def _apart(name: str, a: Any, b: Any) -> tuple[str, Any, Any] | None:
+    """Return the name of the first part in which two pieces of JSON data are not alike, and both;
+    None where they are."""
+    if alike(a, b):
+        return None
+    inner: list[tuple[str, Any, Any]] = []
+    if isinstance(a, Mapping) and isinstance(b, Mapping) and a.keys() == b.keys():
+        inner = [(f"{name}.{key}", a[key], b[key]) for key in a]
+    if isinstance(a, list) and isinstance(b, list) and len(a) == len(b):
+        inner = [(f"{name}[{i}]", *pair) for i, pair in enumerate(zip(a, b, strict=True))]
+    return next(filter(None, (_apart(*part) for part in inner)), (name, a, b))
 
 
 def alike(a: Any, b: Any) -> bool:
