@@ -809,7 +809,11 @@ def within_outputs(mpc: MPC, K: Reals) -> Box | Polytope | None:
     outputs = as_tuple("outputs", mpc.outputs, Outputs)
     end = {mpc.horizon - 1, mpc.horizon}
     last = [rows for rows in outputs if end & set(output_stages(mpc, rows))]
-    return _limits_within(mpc.states, [rows for rows in last if not differing(rows)], K)
+    kept = _limits_within(mpc.states, [rows for rows in last if not differing(rows)], K)
+    if last and kept is not None and kept.is_empty():
+        problem = "hold at no state within the limits under the terminal law u = Kx"
+        fail("outputs", problem, 'Loosen one of the two, or give terminal="none"')
+    return kept
 
 
 def folded(mpc: MPC) -> MPC:

@@ -98,9 +98,10 @@ def load_robot(
 
     What MJX lacks is taken out: where that changes no motion in silence (switches of diagnostics,
     sensors), else with a UserWarning (contacts between shapes for which it has no function, noslip
-    iterations, powers of damping, armature and delay of actuators, adhesion). Short motions of the
-    plant are then compared with those of the file in MuJoCo's C engine, and a UserWarning names the
-    joints, actuators and tendons that move otherwise.
+    iterations, powers of damping, armature and delay of actuators, adhesion of geoms). Short
+    motions of the plant are then compared with those of the file in MuJoCo's C engine, and a
+    UserWarning names the joints, actuators and tendons that move otherwise, or says that the
+    file's solver stops before it has converged.
     `robot.report()` lists all of it, and what acts in the plant but not in linear models.
 
     Raises ValueError for files that MuJoCo cannot read, models without actuators or joints, what
@@ -136,10 +137,12 @@ def load_robot(
     input_names = tuple(named(host, "actuator", "u"))
     _warn_of_limits(name, [*labels, *input_names], [*sources, *input_sources])
     idle, without, unlike = compared(given, plant, missing, inputs, start)
-    _warn_of_differences(name, without, unlike, file.lost)
+    off = host.opt.disableflags & flag("actuation")
+    lost = (*file.lost, *["the forces of its actuators, which the file switches off"] * bool(off))
+    _warn_of_differences(name, without, unlike, lost)
     notes = {
         "cleared": [*cleared, *(f"{text}, without effect" for text in idle)],
-        "left out": [*["all contacts"] * (not contacts), *file.lost, *without, *unlike],
+        "left out": [*["all contacts"] * (not contacts), *lost, *without, *unlike],
         "mended": file.mended,
         "home": [origin],
         "limit": [*sources, *input_sources],

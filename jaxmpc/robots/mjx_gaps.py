@@ -67,6 +67,8 @@ _DROPPED = (
     ("pair_adhesion", "adhesion", "pair", True),
     ("geom_surfacevel", "surfacevel", "geom", True),
 )
+ADHESION = "of adhesion"  # an actuator whose transmission is a body
+
 # Fields that count plugins, -1 for none, which exert forces. MuJoCo does not run without them, but
 # MJX does; those of actuators are refused.
 _PLUGINS = (("body_plugin", "body"),)
@@ -137,7 +139,7 @@ def _require_known(model: "mujoco.MjModel") -> None:
     def refuse(kind: str, rows: np.ndarray, what: str) -> None:
         if len(rows):
             cure = "Put motors or position actuators, one input each, in their place"
-            cure = cure if kind == "actuator" else "Take that out of the file"
+            cure = cure if kind == "actuator" and what != ADHESION else "Take that out of the file"
             fail("model", f"has {_listed(model, kind, '', rows)}, {what}, which MJX lacks", cure)
 
     refuse("actuator", np.flatnonzero(model.actuator_plugin >= 0), "of a plugin")
@@ -153,6 +155,7 @@ def _require_known(model: "mujoco.MjModel") -> None:
         given = getattr(model, field)
         rows = np.flatnonzero(~np.isin(given, [int(kind) for kind in known]))
         of_type = "".join(f"of the type {word(kinds(int(given[i])))}" for i in rows[:1])
+        of_type = ADHESION if of_type == "of the type body" else of_type
         refuse("equality" if field == "eq_type" else "actuator", rows, of_type)
     refuse("flex", np.arange(model.nflex), "deformable")
     integrator = mujoco.mjtIntegrator(model.opt.integrator)
@@ -444,13 +447,36 @@ def _differences(
         exact = copy.deepcopy(reference)
         exact.opt.solver = plant.model.opt.solver
         exact.opt.iterations = max(exact.opt.iterations, 100)
+        exact.opt.ls_iterations = max(exact.opt.ls_iterations, 50)
         exact.opt.tolerance = min(exact.opt.tolerance, 1e-10)
         seen = engine_steps(exact, inputs, home)
-        _known[key] = _unlike(exact, plant, seen) if len(seen.before) else ()
+        early = _stops_early(reference, engine_steps(reference, inputs, home), seen)
+        unlike = _unlike(exact, plant, seen, bool(early)) if len(seen.before) else ()
+        _known[key] = (*early, *unlike)
     return _known[key]
 
 
-def _unlike(model: "mujoco.MjModel", plant: Physics, seen: EngineSteps) -> tuple[str, ...]:
+def _stops_early(model: "mujoco.MjModel", own: EngineSteps, seen: EngineSteps) -> tuple[str, ...]:
+    """Return in words that the solver of a file stops before it has converged, where its own steps
+    are not those `seen` of a solver that has; nothing else where they are."""
+    count = min(len(own.before), len(seen.before))
+    if not count:
+        return ()
+    same = np.all(np.abs(own.before[:count] - seen.before[:count]) <= 1e-9, axis=1)
+    moved = [(v.after - v.before)[:count, model.nq :][same] for v in (own, seen)]
+    off, size = np.abs(moved[0] - moved[1]), np.abs(moved[1]).max(axis=0, initial=0.0)
+    if np.all(off <= IN_CONTACT * size + 1e-9 * size.max(initial=0.0)):
+        return ()
+    solver, most = word(mujoco.mjtSolver(model.opt.solver)), model.opt.iterations
+    return (
+        f"forces of contacts and limits, which the file's {solver} solver (iterations={most}) "
+        "leaves before it has converged (raise iterations and ls_iterations)",
+    )
+
+
+def _unlike(
+    model: "mujoco.MjModel", plant: Physics, seen: EngineSteps, explained: bool
+) -> tuple[str, ...]:
     nq, h = model.nq, model.opt.timestep
     a, wanted = ((after - seen.before)[:, nq:] / h for after in (_steps(plant, seen), seen.after))
     off = np.abs(np.where(np.isfinite(a), a, np.inf) - wanted)
@@ -469,7 +495,8 @@ def _unlike(model: "mujoco.MjModel", plant: Physics, seen: EngineSteps) -> tuple
     ranked = sorted(worst.values(), key=lambda entry: -entry[0])
     if not ranked:
         return ()
-    texts = [*_sources(model, plant, seen, ranked[0][2]), *(text for _, text, _ in ranked[:3])]
+    sources = [] if explained else _sources(model, plant, seen, ranked[0][2])
+    texts = [*sources, *(text for _, text, _ in ranked[:3])]
     return (*texts, f"{len(ranked) - 3} more") if len(ranked) > 3 else tuple(texts)
 
 

@@ -27,7 +27,7 @@ from jaxmpc.qp.linalg import matmul
 from jaxmpc.robots.configurations import difference, nearest_turns, quaternions, retract
 from jaxmpc.robots.contacts import standing_physics, touching_spheres
 from jaxmpc.robots.couplings import MET, Couplings
-from jaxmpc.robots.description import RobotDescription
+from jaxmpc.robots.description import RobotDescription, host_coordinates
 from jaxmpc.robots.equilibria import (
     inverse_actuation,
     lacking,
@@ -194,6 +194,14 @@ class Robot(RobotDescription):
             q = Couplings(self.predictor.model).met(self.home[: self.mujoco.nq])
         return self._equilibria("q", q)
 
+    def _require_inside(self, argument: str, x: np.ndarray) -> None:
+        """Raise ValueError where a position of the state x (nq + nv + na,) is beyond its limits."""
+        xi, (lower, upper) = host_coordinates(self, x), self.state_limits.bounds()
+        for i in np.flatnonzero((xi < lower) | (xi > upper))[:1]:
+            name, unit = self.state_names[i], self.state_units[i]
+            problem = f"has {name} = {xi[i]:g} {unit}, limits are [{lower[i]:g}, {upper[i]:g}]"
+            fail(argument, problem, "Choose a configuration inside them")
+
     def _equilibria(self, argument: str, q: Any) -> tuple[np.ndarray, np.ndarray]:
         """Return (x, u) of the robot at rest in q (..., nq), as `equilibrium`; errors name the
         argument that gave q."""
@@ -212,6 +220,8 @@ class Robot(RobotDescription):
         if feet is not None:
             cure = "Choose another configuration, or give more torque, or feet with more friction"
         for rest in rests:
+            if not rest.balanced or np.any(rest.over):
+                self._require_inside(argument, rest.x)
             if not rest.balanced:
                 missing = f"no input balances the forces; {lacking(self, rest)}"
                 fail(argument, f"{rest.q}: {missing}", cure)

@@ -138,7 +138,7 @@ def require_disturbance(argument: str, W: Any, dimension: int) -> None:
     if not bounded:
         fail(argument, "is unbounded", "Bound every coordinate")
     if not held:
-        cure = "Move it by -w for a w in it, and the system's c by w, or by E w"
+        cure = "Move it by -w for a w in it, and c of x(k+1) = A x(k) + B u(k) + c by w, or by E w"
         fail(argument, "does not hold the origin", cure)
 
 

@@ -186,7 +186,7 @@ def require_one_reading(argument: str, limit: Any, count: int) -> None:
     """Raise where two numbers for `count` = 2 coordinates may be meant as one limit each: those
     that leave out 0, read as (lower, upper)."""
     pair = isinstance(limit, tuple | list | np.ndarray) and not any(map(np.ndim, limit))
-    if count != 2 or not pair:
+    if count != 2 or not pair or len(limit) != 2:
         return
     a, b = (float(v) for v in limit)
     if a > 0 or b < 0:

@@ -20,7 +20,8 @@ from jaxmpc.systems.system import LinearSystem
 from jaxmpc.systems.units import natural_units
 
 NO_LQR = (
-    'Put a positive weight on every direction, or take another terminal cost (P = "Q" in files)'
+    "Put a positive weight on every direction, or do without the LQR "
+    '(P = "Q", terminal = "none" in files)'
 )
 
 # Modes closer than this to unreachable (least singular value, relative) count as such.

@@ -4,11 +4,13 @@ import gc
 import io
 import json
 import os
+import re
 import shlex
 import shutil
 import signal
 import subprocess
 import sys
+import textwrap
 import time
 from dataclasses import replace
 from importlib.metadata import version
@@ -23,6 +25,7 @@ from command_line import error_of, help_page, run
 from jaxmpc.app import cli
 from jaxmpc.app import config as configs
 from jaxmpc.app.commands import recursion
+from jaxmpc.app.commands.verify import contradictions
 from jaxmpc.feasible import pipeline, stored
 from jaxmpc.feasible.pipeline import Labels
 from jaxmpc.feasible.problem import FeasibilityProblem
@@ -615,6 +618,45 @@ def test_verify_a_recursion_report(tmp_path, capsys):
     (tmp_path / "rec/recursion.npz").write_bytes(b"garbled")
     assert run("verify rec") == 1
     assert "cannot be read" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("terminal", ["none", "invariant"])
+def test_results_of_problems_with_outputs_verify(terminal, tmp_path):
+    """Limits of outputs are rows of the states to `recursive_feasibility`, in the file they are
+    rows of their own: the same problem."""
+    text = """
+        [system]
+        dt = 0.1
+        A = [[1.0, 0.1], [0.0, 1.0]]
+        B = [[0.005], [0.1]]
+        [cost]
+        Q = [1.0, 1.0]
+        R = [0.1]
+        [limits]
+        x_min = [-1.0, -1.0]
+        x_max = [1.0, 1.0]
+        u_min = [-1.0]
+        u_max = [1.0]
+        [[outputs]]
+        C = [[1.0, 0.5]]
+        lower = [-0.9]
+        upper = [0.8]
+        [mpc]
+        horizon = 3
+    """
+    (tmp_path / "a.toml").write_text(f'{textwrap.dedent(text)}terminal = "{terminal}"\n')
+    for command in ("recursion", "sweep"):
+        words = "--grid 7 7 --lower -1 -1 --upper 1 1"
+        assert run(f"{command} --config a.toml {words} --output {command}") == 0
+        assert run(f"verify {command}") == 0
+    record, _ = read_arrays(tmp_path / "recursion/recursion.npz")
+    config = json.loads((tmp_path / "recursion/summary.json").read_text())["config"]
+    given = {"problem": record["problem"], "config": config}
+    assert contradictions(given, {}) == []
+    config["outputs"][0]["upper"] = [0.85]
+    (said,) = contradictions(given, {})
+    assert re.match(r"problem.rows\[1\].upper\[\d\]: 0.8, the configuration says 0.85", said), said
 
 
 @pytest.mark.parametrize("unbuffered", ["", "1"])

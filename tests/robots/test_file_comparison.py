@@ -100,7 +100,6 @@ RIGHT = {
     "flag damper of tendons": {
         **on_tendon(ROPE.format('stiffness="9" damping="2"')), "flag": '<flag damper="disable"/>'
     },
-    "flag actuation": {"flag": '<flag actuation="disable"/>'},
     "flag eulerdamp": {"joint": 'damping=".5"', "flag": '<flag eulerdamp="disable"/>'},
     "flag limit": {"joint": 'range="-1 1"', "flag": '<flag limit="disable"/>'},
     "flag frictionloss": {
@@ -262,13 +261,21 @@ NAMED = {
         {"world": FLOOR.format(""), "option": 'cone="elliptic" noslip_iterations="5"'},
         "noslip iterations",
     ),
+    "solver that stops early": (
+        {"world": FLOOR.format(""), "option": 'iterations="1" ls_iterations="2"'},
+        "newton solver (iterations=1) leaves before it has converged",
+    ),
+    "flag actuation": (
+        {"flag": '<flag actuation="disable"/>'},
+        "the forces of its actuators, which the file switches off",
+    ),
     "implicitfast of a free body": (
         {"world": FREE, "option": 'integrator="implicitfast"'}, "joint f accelerates"
     ),
 }  # fmt: skip
 
-# Named wherever shapes may touch or bodies rest, which nothing does in the motions here.
-UNSEEN = ("noslip", "flag sleep")
+# Named wherever shapes may touch, bodies rest or inputs do nothing, also without a difference.
+UNSEEN = ("noslip", "flag sleep", "flag actuation")
 
 # What is refused at load.
 REFUSED = {
@@ -286,7 +293,7 @@ REFUSED = {
     "flag override": ({"flag": '<flag override="enable"/>'}, "has the flag override, which MJX"),
     "dyntype user": ({"actuator": GENERAL.format('dyntype="user"')}, "has actuator m, of the type"),
     "adhesion actuator": ({"actuator": '<adhesion name="g" body="b" ctrlrange="0 1"/>',
-                           "world": FLOOR.format("")}, "has actuator g, of the type body"),
+                           "world": FLOOR.format("")}, "has actuator g, of adhesion, which MJX"),
     "flex": ({"world": '<flexcomp type="grid" count="3 3 1" spacing=".1 .1 .1" name="f" mass="1" '
               'dim="2" radius=".01"/>'}, "has flex f, deformable, which MJX lacks"),
     "a fluid in implicitfast": ({"option": 'integrator="implicitfast" density="9"'},

@@ -599,6 +599,9 @@ def grid_shape(config: Config) -> tuple[int, ...]:
 
 def recursion_states(config: Config) -> np.ndarray | None:
     """Return states (B, n) for `recursive_feasibility`; None for its own choice (n > 3)."""
+    if config.disturbance is not None:
+        problem = "given beside [disturbance], under which no samples are followed"
+        fail("recursion.grid, lower, upper", problem, "Leave them out")
     shape, axes = recursion_shape(config), range(config.dimension)
     return None if shape is None else grid(*section_ends(config, axes, config.recursion), shape)
 

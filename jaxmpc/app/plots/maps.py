@@ -305,7 +305,10 @@ def plot_recursion(
     if worst is not None:
         if enlarge:
             ends = np.array([worst.state, worst.next_state])
-            room = 0.6 * np.maximum(np.ptp(ends, axis=0), 0.15 * np.ptp(ends, axis=0).max())
+            shown = corners if len(corners) else np.vstack([ends, report.loops.x0s])
+            unit = np.ptp(shown, axis=0)  # of one axis says nothing of the other
+            apart = np.ptp(ends, axis=0) / unit
+            room = 0.6 * unit * np.maximum(apart, 0.15 * apart.max())
             (x_low, y_low), (x_high, y_high) = ends.min(axis=0) - room, ends.max(axis=0) + room
             ax.set(xlim=(x_low, x_high), ylim=(y_low, y_high))
         handles += _draw_counterexample(ax, worst)
