@@ -87,7 +87,9 @@ class TerminalReport:
 
     def __repr__(self) -> str:
         """Return what the checks say of each theorem."""
-        lines = ["With limits of states, outputs C x among them, and of inputs, none of rates; moves free:"]
+        lines = [
+            "With limits of inputs and states, outputs C x among these, none of rates, moves free:"
+        ]
         for number, title in ((1, "recursive feasibility"), (3, "asymptotic stability")):
             missing = [c.name for c in self.checks if number in c.theorems and not c.holds]
             answer = f"does not apply: {', '.join(missing)}" if missing else "applies"

@@ -257,8 +257,21 @@ def test_recursion_shows_fates_set_and_counterexample(tmp_path):
     assert ax.get_xlim()[0] < -0.5 and ax.get_ylim()[0] < -0.5  # all of the set in view
     ax = plot_recursion(report, Figure().add_subplot(), enlarge=True)
     assert not ax.images and ax.get_xlim()[0] > -0.5 and ax.get_xlim()[1] > 1.2
-    assert "next state 0.2 outside" in ax.get_title(loc="left")
+    assert "next state outside X_" in ax.get_title(loc="left")
     ax.figure.savefig(tmp_path / "enlarged.png")
+    # The neighbourhood that is shown does not depend on units.
+    unit = np.array([1.0, 1e4])
+    worst = report.counterexample
+    ends = {name: getattr(worst, name) * unit for name in ("state", "next_state")}
+    other = dataclasses.replace(
+        report,
+        counterexample=dataclasses.replace(worst, normal=worst.normal / unit, **ends),
+        feasible_set=np.diag(unit) @ report.feasible_set,
+        loops=dataclasses.replace(report.loops, x0s=report.loops.x0s * unit),
+    )
+    other_ax = plot_recursion(other, Figure().add_subplot(), enlarge=True)
+    np.testing.assert_allclose(other_ax.get_xlim(), ax.get_xlim(), rtol=1e-9)
+    np.testing.assert_allclose(other_ax.get_ylim(), 1e4 * np.array(ax.get_ylim()), rtol=1e-9)
     random = np.random.default_rng(0).uniform(-2, 2, (300, 2))
     ax = plot_recursion(recursion_report(random, worst=False))
     assert not ax.images and "half-space it leaves" not in texts(ax)

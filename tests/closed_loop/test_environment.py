@@ -263,7 +263,10 @@ def test_bad_environments_are_named(environment):
         (lambda: Environment.of(robot, length=0), "length: 0"),
         (lambda: Environment.of(robot, spread=-1.0), "spread: -1.0. Give a fraction"),
         (lambda: Environment.of(robot, Q=[1.0, 1.0, 1.0], R=[1.0]), "Q: shape"),
-        (lambda: Environment.of(robot, [1.0], Q=[1.0, 1.0], R=[1.0]), "target: needs torque"),
+        (
+            lambda: Environment.of(robot, [1.0], Q=[1.0, 1.0], R=[1.0]),
+            "target: has theta = 1 rad, limits are",
+        ),
         (lambda: Environment.of(robot, Q=[1.0, -5.0], R=[1.0]), "Q: .*not positive semidef"),
         (lambda: Environment.of(robot, Q=[1.0, 5.0], R=[np.nan]), "R: holds NaN"),
         (lambda: Environment.of(robot, stop_at_limits="no"), "stop_at_limits: 'no'. Give True"),

@@ -347,7 +347,7 @@ def test_bad_problems_and_controllers_are_named(pendulum, linear_mpc):
         (lambda: make(PLANT, Q, R, 0), "horizon: "),
         (lambda: make(PLANT, Q, R, terminal_cost="dare"), "terminal_cost: 'dare'. Give"),
         (lambda: make(PLANT, Q, R, target=[1.6, 0.0]), "target: "),
-        (lambda: make(pendulum, Q, R, target=[1.0]), "target: needs torque"),
+        (lambda: make(pendulum, Q, R, target=[1.0]), "target: has theta = 1 rad, limits are"),
         (
             lambda: jm.RobotController(pendulum, mpc, solver, linearize="once"),
             "linearize: 'once'. Give one of set-point, state, trajectory",

@@ -35,7 +35,7 @@ def test_terminal_set_of_the_joint_and_its_certificate():
     assert all(check.holds for check in report.checks)
     assert "Theorem 1 (recursive feasibility) applies." in str(report)
     assert str(report).startswith(
-        "With limits of states, outputs C x among them, and of inputs, none of rates; moves free"
+        "With limits of inputs and states, outputs C x among these, none of rates, moves free"
     )
     assert len(str(report).splitlines()) == 3 + 2 * len(report.checks)
     # M >= 0, M H = H (A + BK), M h <= h, in rationals; the set's rows were rounded themselves

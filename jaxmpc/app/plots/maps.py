@@ -308,7 +308,7 @@ def plot_recursion(
             shown = corners if len(corners) else np.vstack([ends, report.loops.x0s])
             unit = np.ptp(shown, axis=0)  # of one axis says nothing of the other
             apart = np.ptp(ends, axis=0) / unit
-            room = 0.6 * unit * np.maximum(apart, 0.15 * apart.max())
+            room = 0.6 * unit * np.maximum(apart, 0.15 * np.max(apart))
             (x_low, y_low), (x_high, y_high) = ends.min(axis=0) - room, ends.max(axis=0) + room
             ax.set(xlim=(x_low, x_high), ylim=(y_low, y_high))
         handles += _draw_counterexample(ax, worst)
@@ -317,7 +317,7 @@ def plot_recursion(
         verdict = {True: "kept for ever", False: "not all kept", None: "not followed"}
         title = f"Feasible states, {verdict[report.law.holds]}, horizon N = {report.mpc.horizon}"
     if enlarge and worst is not None:
-        title = f"Worst counterexample: next state {worst.distance:.4g} outside"
+        title = f"Worst counterexample: next state outside X_{report.mpc.horizon}"
     finish(ax, report.mpc.labels, title, handles)
     return ax
 
