@@ -197,7 +197,8 @@ class Robot(RobotDescription):
     def _require_inside(self, argument: str, x: np.ndarray) -> None:
         """Raise ValueError where a position of the state x (nq + nv + na,) is beyond its limits."""
         xi, (lower, upper) = host_coordinates(self, x), self.state_limits.bounds()
-        for i in np.flatnonzero((xi < lower) | (xi > upper))[:1]:
+        beyond = np.maximum(lower - xi, xi - upper) > 1e-9 * self.state_limits.half_widths()
+        for i in np.flatnonzero(beyond)[:1]:
             name, unit = self.state_names[i], self.state_units[i]
             problem = f"has {name} = {xi[i]:g} {unit}, limits are [{lower[i]:g}, {upper[i]:g}]"
             fail(argument, problem, "Choose a configuration inside them")

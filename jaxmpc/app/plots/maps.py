@@ -307,6 +307,7 @@ def plot_recursion(
             ends = np.array([worst.state, worst.next_state])
             shown = corners if len(corners) else np.vstack([ends, report.loops.x0s])
             unit = np.ptp(shown, axis=0)  # of one axis says nothing of the other
+            unit = np.where(unit > 0, unit, 1.0)
             apart = np.ptp(ends, axis=0) / unit
             room = 0.6 * unit * np.maximum(apart, 0.15 * np.max(apart))
             (x_low, y_low), (x_high, y_high) = ends.min(axis=0) - room, ends.max(axis=0) + room
