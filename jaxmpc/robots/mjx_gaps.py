@@ -67,8 +67,6 @@ _DROPPED = (
     ("pair_adhesion", "adhesion", "pair", True),
     ("geom_surfacevel", "surfacevel", "geom", True),
 )
-ADHESION = "of adhesion"  # an actuator whose transmission is a body
-
 # Fields that count plugins, -1 for none, which exert forces. MuJoCo does not run without them, but
 # MJX does; those of actuators are refused.
 _PLUGINS = (("body_plugin", "body"),)
@@ -136,15 +134,18 @@ def _require_known(model: "mujoco.MjModel") -> None:
     equalities, integrators and switches that MJX does not know, and for deformable bodies."""
     from mujoco.mjx._src import types
 
-    def refuse(kind: str, rows: np.ndarray, what: str) -> None:
+    out = "Take that out of the file"
+    replace = "Put motors or position actuators, one input each, in their place"
+
+    def refuse(kind: str, rows: np.ndarray, what: str, cure: str) -> None:
         if len(rows):
-            cure = "Put motors or position actuators, one input each, in their place"
-            cure = cure if kind == "actuator" and what != ADHESION else "Take that out of the file"
             fail("model", f"has {_listed(model, kind, '', rows)}, {what}, which MJX lacks", cure)
 
-    refuse("actuator", np.flatnonzero(model.actuator_plugin >= 0), "of a plugin")
+    refuse("actuator", np.flatnonzero(model.actuator_plugin >= 0), "of a plugin", replace)
     inputs = getattr(model, "actuator_ctrlnum", np.ones(0))
-    refuse("actuator", np.flatnonzero(inputs != 1), "with several inputs")
+    refuse("actuator", np.flatnonzero(inputs != 1), "with several inputs", replace)
+    adheres = model.actuator_trntype == mujoco.mjtTrn.mjTRN_BODY
+    refuse("actuator", np.flatnonzero(adheres), "of adhesion", out)
     for field, known, kinds in (
         ("actuator_trntype", types.TrnType, mujoco.mjtTrn),
         ("actuator_dyntype", types.DynType, mujoco.mjtDyn),
@@ -155,9 +156,9 @@ def _require_known(model: "mujoco.MjModel") -> None:
         given = getattr(model, field)
         rows = np.flatnonzero(~np.isin(given, [int(kind) for kind in known]))
         of_type = "".join(f"of the type {word(kinds(int(given[i])))}" for i in rows[:1])
-        of_type = ADHESION if of_type == "of the type body" else of_type
-        refuse("equality" if field == "eq_type" else "actuator", rows, of_type)
-    refuse("flex", np.arange(model.nflex), "deformable")
+        kind, cure = ("equality", out) if field == "eq_type" else ("actuator", replace)
+        refuse(kind, rows, of_type, cure)
+    refuse("flex", np.arange(model.nflex), "deformable", out)
     integrator = mujoco.mjtIntegrator(model.opt.integrator)
     if word(integrator) not in ("euler", "rk4", "implicitfast"):
         cure = 'Write integrator="implicitfast"'

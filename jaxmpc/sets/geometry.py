@@ -88,9 +88,8 @@ class Frame(NamedTuple):
         many = np.array([len(rows) for rows in facets])
         for count in np.unique(many):
             at = np.array([rows for rows in facets if len(rows) == count])
-            moved[many == count] = (np.abs(np.linalg.pinv(self.Z[at])) @ lost[at][..., None])[
-                ..., 0
-            ]
+            inverse = np.abs(np.linalg.pinv(self.Z[at]))
+            moved[many == count] = np.einsum("kij,kj->ki", inverse, lost[at])
         return np.minimum(moved, 1e-3)
 
     @property

@@ -958,9 +958,8 @@ class Zonotope(LinearSet):
     def support(self, d: Reals) -> AnyNumber:
         """Return max d'x over the zonotope = d'center + |generators'd|_1, for one direction d (n,)
         or for each of many (k, n)."""
-        self._require_fields("Zonotope")
-        d, _ = one_or_many("d", d, self.dimension)
         self.validate("Zonotope")
+        d, _ = one_or_many("d", d, self.dimension)
         xp, (along, center, G) = numbers(d, self.center, self.generators)
         return product(xp, along, center) + xp.abs(product(xp, along, G)).sum(axis=-1)
 

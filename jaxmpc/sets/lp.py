@@ -392,7 +392,6 @@ class Model:
         matrix.start_ = np.searchsorted(columns, np.arange(n + 1))
         matrix.index_, matrix.value_ = places, M[places, columns]
         self.size, self.equal, self._alone = (rows, n), equal, threading.Lock()
-        self.last_column = M[:, -1].copy()
         # (Its subclass `Highs` prints a banner when it is made.)
         self.highs = highspy._Highs()  # type: ignore[attr-defined]
         # On ill-conditioned data HiGHS may cycle: its steps are limited.
@@ -405,11 +404,10 @@ class Model:
 
     def change_last_column(self, values: np.ndarray) -> None:
         """Put other values (rows,) in place of the last column of M."""
-        last, changed = self.size[1] - 1, np.flatnonzero(values != self.last_column)
-        self.last_column = values.copy()
+        rows, n = self.size
         with self._alone:
-            for i in changed:
-                self.highs.changeCoeff(i, last, values[i])
+            for i in range(rows):
+                self.highs.changeCoeff(i, n - 1, values[i])
 
     def forget(self) -> None:
         """Begin the next program anew, without a basis."""
